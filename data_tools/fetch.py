@@ -136,14 +136,14 @@ def _download_missing(url: str, part: Path, report: Report) -> None:
         if size and response.status != 206:
             size = 0
         length = int(response.headers.get("Content-Length") or 0)
-        total_size, reported = size + length, -1
+        total_size, reported_tenth = size + length, -1
         with part.open("ab" if size else "wb") as file:
             while chunk := response.read(CHUNK):
                 file.write(chunk)
                 size += len(chunk)
                 tenth = 10 * size // total_size if total_size else 0
-                if tenth > reported:
-                    reported = tenth
+                if tenth > reported_tenth:
+                    reported_tenth = tenth
                     report(f"{size / 1e6:,.0f} of {total_size / 1e6:,.0f} MB")
     if length and size < total_size:
         raise _IncompleteError(f"got {size} of {total_size} bytes")

@@ -100,7 +100,7 @@ def lpips_network(weights: Weights, net: Net) -> bytes:
     def features(x: str) -> list[str]:
         x = graph.add("Sub", x, graph.constant("shift", np.reshape(SHIFT, (1, 3, 1, 1))))
         x = graph.add("Div", x, graph.constant("scale", np.reshape(SCALE, (1, 3, 1, 1))))
-        normalized = []
+        outputs = []
         for i, layer in enumerate(layers):
             if layer == "c":
                 name = f"{key}/Conv_{layers[:i].count('c')}"
@@ -114,14 +114,14 @@ def lpips_network(weights: Weights, net: Net) -> bytes:
                 ones = np.ones((1, 1, kernel.shape[3], 1))
                 square = graph.convolve(graph.add("Mul", x, x), f"ones_{i}", ones)
                 length = graph.add("Add", graph.add("Sqrt", square), graph.constant("eps", np.full((1, 1, 1, 1), EPS)))
-                normalized.append(graph.add("Div", x, length))
-        return normalized
+                outputs.append(graph.add("Div", x, length))
+        return outputs
 
     for i, pair in enumerate(zip(*map(features, INPUTS), strict=True)):
         difference = graph.add("Sub", *pair)
         name = f"NetLinLayer_{i}/Conv_0/kernel"
-        weighted = graph.convolve(graph.add("Mul", difference, difference), name, weights[name])
-        mean = graph.add("ReduceMean", weighted, axes=(2, 3))
+        distances = graph.convolve(graph.add("Mul", difference, difference), name, weights[name])
+        mean = graph.add("ReduceMean", distances, axes=(2, 3))
         total = graph.add("Add", total, mean) if total else mean
     return graph.model(INPUTS, total)
 

@@ -22,9 +22,9 @@ def noise(points: Array, octaves: int = 1) -> Array:
     """
     total = np.zeros(points.shape[1])
     for octave in range(octaves):
-        scaled = points * 2.0**octave + 17.3 * octave
-        cell = np.floor(scaled)
-        fraction = scaled - cell
+        scaled_points = points * 2.0**octave + 17.3 * octave
+        cell = np.floor(scaled_points)
+        fraction = scaled_points - cell
         weight = fraction * fraction * (3 - 2 * fraction)
         corner = cell.astype(np.int64).astype(np.uint32)
         x, y, z = (np.stack((c, c + 1)) * np.uint32(prime) for c, prime in zip(corner, PRIMES, strict=True))

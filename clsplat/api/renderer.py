@@ -155,10 +155,10 @@ class Renderer:
         view.camera.check()
         camera, color = upload_camera(self.device, view), self._color(background)
         model = self._model if background is None else replace(self._model, sky=None)
-        rendered = render_layers(self.rasterizer, model, camera, self.device.upload(color), depth)
-        for values in rendered.arrays:
+        layers = render_layers(self.rasterizer, model, camera, self.device.upload(color), depth)
+        for values in layers.arrays:
             require_finite(values, view)
-        return RenderResult(rendered.image, rendered.alpha, rendered.depth, view, color, model, self)
+        return RenderResult(layers.image, layers.alpha, layers.depth, view, color, model, self)
 
     def render_batch(
         self, views: Sequence[View], background: Color | None = None, depth: bool = False
@@ -228,10 +228,10 @@ def _depth_planes(frame: Frame, alpha: Floats | None, depth: Floats | None) -> F
     if alpha is not None:
         planes[:, :, 1] = _check_shape("alpha", alpha, size)
     if depth is not None:
-        weighted, weight = frame.image.get()[:2, : size[0], : size[1]]
+        weighted_depth, weight = frame.image.get()[:2, : size[0], : size[1]]
         is_covered = weight > 0
         planes[is_covered, 0] = _check_shape("depth", depth, size)[is_covered] / weight[is_covered]
-        planes[is_covered, 1] -= planes[is_covered, 0] * weighted[is_covered] / weight[is_covered]
+        planes[is_covered, 1] -= planes[is_covered, 0] * weighted_depth[is_covered] / weight[is_covered]
     return planes
 
 
@@ -266,7 +266,7 @@ class FieldRenderer:
         Raises ValueError for an invalid camera, and NumericError if a value of the result is not finite.
         """
         view.camera.check()
-        rendered = self._field.render_layers(upload_camera(self.device, view), depth)
-        for values in rendered.arrays:
+        layers = self._field.render_layers(upload_camera(self.device, view), depth)
+        for values in layers.arrays:
             require_finite(values, view)
-        return rendered
+        return layers

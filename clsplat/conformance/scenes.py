@@ -74,9 +74,9 @@ class Case:
         settings = self.projection_settings()
         splats = ref.project(self.gaussians(), self.camera(), self.degree, **settings, thresholds=thresholds)
         if self.dropout:
-            dropped = ref.drop_mask(**vars(self.dropout), count=len(splats.visible))
+            drop_mask = ref.drop_mask(**vars(self.dropout), count=len(splats.visible))
             for values in (values for values in vars(splats).values() if isinstance(values, np.ndarray)):
-                values[dropped] = 0
+                values[drop_mask] = 0
         return splats
 
 

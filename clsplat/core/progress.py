@@ -63,10 +63,10 @@ def listening(listener: Listener) -> Iterator[None]:
 
     It is called from the thread of the block or from the thread of `polled`.
     """
-    outer = _listener.get()
+    outer_listener = _listener.get()
 
     def call_both(label: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
-        for call in filter(None, (outer, listener)):
+        for call in filter(None, (outer_listener, listener)):
             call(label, done, total, seconds_left=seconds_left)
 
     token = _listener.set(call_both)

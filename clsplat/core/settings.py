@@ -103,7 +103,7 @@ def descriptions(kind: type[BaseModel]) -> dict[str, str]:
 
     The source is parsed on demand: parsing all classes would add a third to the time of each start.
     """
-    texts: dict[str, str] = {}
+    result: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if not (issubclass(base, BaseModel) and base.__annotations__):
             continue
@@ -115,8 +115,8 @@ def descriptions(kind: type[BaseModel]) -> dict[str, str]:
         for node, next_node in itertools.pairwise(tree.body):
             match node, next_node:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                    texts[name] = inspect.cleandoc(text)
-    return {name: text for name, text in texts.items() if name in kind.model_fields}
+                    result[name] = inspect.cleandoc(text)
+    return {name: text for name, text in result.items() if name in kind.model_fields}
 
 
 def variant_tag(kind: type[Settings]) -> tuple[str, str] | None:
@@ -218,8 +218,8 @@ def in_one_sentence(expected: str) -> WrapValidator:
         try:
             return validate(value)
         except ValidationError as error:
-            texts = [e["msg"].removeprefix("Value error, ") for e in error.errors() if e["type"] == "value_error"]
-            raise ValueError(next((text for text in texts if not expected.startswith(text)), expected)) from None
+            messages = [e["msg"].removeprefix("Value error, ") for e in error.errors() if e["type"] == "value_error"]
+            raise ValueError(next((text for text in messages if not expected.startswith(text)), expected)) from None
 
     return WrapValidator(validate_any)
 

@@ -223,10 +223,10 @@ class Edit:
         Gaussians with the smallest means of the first scalar statistic are undone first.
         """
         rows = self.rows().astype(np.int64)
-        growing = np.flatnonzero(rows > 1)
+        growing_rows = np.flatnonzero(rows > 1)
         scalars = [name for name, column in self.stats.columns.items() if column.components == 1]
         score = self.stats.mean(scalars[0]) if scalars else np.zeros(len(rows), np.float32)
-        order = growing[np.argsort(-score[growing], kind="stable")]
+        order = growing_rows[np.argsort(-score[growing_rows], kind="stable")]
         total = int(np.minimum(rows, 1).sum()) + np.cumsum(rows[order] - 1)
         undo_mask = np.zeros(len(rows), bool)
         undo_mask[order[total > limit]] = True

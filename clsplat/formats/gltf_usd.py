@@ -96,10 +96,10 @@ class Gltf:
         relative = FLIP_4 @ np.linalg.inv(first) @ matrix @ FLIP_4
         scale = float(np.cbrt(np.linalg.det(relative[:3, :3])))
         try:
-            transformed = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
+            tables = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
         except ValueError as error:
             raise DataError(f"{self.path}: the transform of a node is not supported: {error}") from error
-        return part | {name: table.astype(np.float32) for name, table in transformed.items()}
+        return part | {name: table.astype(np.float32) for name, table in tables.items()}
 
     def _read_primitive(self, primitive: dict[str, Any]) -> Parameters:
         """Return the Gaussians of one primitive, in the axes of glTF."""
@@ -110,8 +110,8 @@ class Gltf:
             raise DataError(f"{self.path}: its kernel is {quote(kernel)}; expected 'ellipse'; export it again")
         if (view := _spz_view(extensions)) is not None:
             part = self._read_spz(view, names)
-        elif compressed := [name for name in extension.get("extensions", {}) if "compression" in name]:
-            raise DataError(f"{self.path}: is compressed with {quote(compressed[0])}; export it without compression")
+        elif compressions := [name for name in extension.get("extensions", {}) if "compression" in name]:
+            raise DataError(f"{self.path}: is compressed with {quote(compressions[0])}; export it without compression")
         else:
             part = self._attributes(names)
         if space == LINEAR:
@@ -199,8 +199,8 @@ class Gltf:
     def _view(self, number: Any, stride: int = 0) -> tuple[bytes, int, int, int]:
         """Return a buffer, and the offset, length, and stride of a view in it, bytes.  stride: the default."""
         view = self.tree["bufferViews"][_index(number)]
-        if compressed := [name for name in view.get("extensions", {}) if "compression" in name]:
-            raise DataError(f"{self.path}: is compressed with {quote(compressed[0])}; export it without compression")
+        if compressions := [name for name in view.get("extensions", {}) if "compression" in name]:
+            raise DataError(f"{self.path}: is compressed with {quote(compressions[0])}; export it without compression")
         buffer = self.tree["buffers"][_index(view["buffer"])]
         data = self._content(buffer.get("uri"), view["buffer"])
         length, offset = _index(view["byteLength"]), _index(view.get("byteOffset", 0))
@@ -241,13 +241,13 @@ class Gltf:
         """Return the index of each mesh in the scene and the world matrix, [4, 4], of its node."""
         nodes = self.tree["nodes"]
         meshes: list[tuple[int, NDArray[np.float64]]] = []
-        visited: set[int] = set()
+        visited_nodes: set[int] = set()
         pending = [(_index(root), np.eye(4)) for root in self._roots()]
         while pending:
             number, parent_matrix = pending.pop()
-            if number in visited:
+            if number in visited_nodes:
                 raise DataError(f"{self.path}: its nodes are not a tree: node {number} occurs twice; export it again")
-            visited.add(number)
+            visited_nodes.add(number)
             matrix = parent_matrix @ self._matrix(number)
             if not np.isfinite(matrix).all():
                 raise DataError(f"{self.path}: node {number} has no finite transform; export it again")

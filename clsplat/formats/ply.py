@@ -371,8 +371,8 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_degree(path, names)) - 1)))
     parameters = {name: _columns(vertices, columns) for name, columns in columns_by_name.items()}
     if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, which a float cannot hold
-        doubles = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
-        parameters["means"] = np.where(np.isfinite(parameters["means"]), doubles, parameters["means"])
+        exact_means = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
+        parameters["means"] = np.where(np.isfinite(parameters["means"]), exact_means, parameters["means"])
     rest = reorder_columns(_columns(vertices, columns), 3, len(columns) // 3)
     parameters["sh_rest"] = np.ascontiguousarray(rest[:, : 3 * (sh_coefficients(MAX_DEGREE) - 1)])
     if is_flat:

@@ -76,8 +76,8 @@ def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[n
         rotations, max_abs_w = np.where(abs_w > max_abs_w, index, rotations), np.maximum(abs_w, max_abs_w)
     largest, components = smallest_three(multiply(q, _ROTATIONS[rotations]))
     levels = np.clip(np.rint(255 * (components * 0.5**0.5 + 0.5) / step) * step, 0, 255)
-    rounded = from_smallest_three(largest, (levels / 255 - 0.5) * 2**0.5)
-    return rounded, log_scales[rows[:, None], _axes(_ROTATIONS)[rotations]].astype(np.float32)
+    rounded_quats = from_smallest_three(largest, (levels / 255 - 0.5) * 2**0.5)
+    return rounded_quats, log_scales[rows[:, None], _axes(_ROTATIONS)[rotations]].astype(np.float32)
 
 
 def _axes(rotations: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -146,7 +146,7 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
     inverse = np.linalg.inv(form[::-1, ::-1])
     feedback = np.linalg.cholesky(inverse).T.astype(np.float32)
     feedback /= np.diag(feedback)[:, None].copy()
-    rounded = np.empty(rest.shape, np.float32)
+    rounded_sh = np.empty(rest.shape, np.float32)
     for start in range(0, len(rest), ROWS):
         block, step = rest[start : start + ROWS], steps[start : start + ROWS]
         remaining = np.ascontiguousarray(block.reshape(len(block), count, 3)[:, ::-1].transpose(1, 2, 0), np.float32)
@@ -156,8 +156,8 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
             error = exact - remaining[k]
             for later in range(k + 1, count):
                 remaining[later] -= feedback[k, later] * error
-        rounded[start : start + ROWS] = remaining[::-1].transpose(2, 0, 1).reshape(block.shape)
-    return rounded
+        rounded_sh[start : start + ROWS] = remaining[::-1].transpose(2, 0, 1).reshape(block.shape)
+    return rounded_sh
 
 
 # Compute a large SH palette by splitting clusters of Gaussians recursively.
@@ -190,8 +190,8 @@ def tree_palette(
     order = np.lexsort((first, step))
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    rounded = round_sh(SH_LEVELS * vectors, step, form).astype(np.float64) / SH_LEVELS
-    return rounded[order], rank[labels]
+    rounded_vectors = round_sh(SH_LEVELS * vectors, step, form).astype(np.float64) / SH_LEVELS
+    return rounded_vectors[order], rank[labels]
 
 
 def _to_euclidean(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -58,8 +58,8 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
             raise DataError(f"{name}: is {kinds[1]}, but {names[0]} is {kinds[0]}; merge only models of one kind")
         values, first_values = model.rendering.comment(), first.rendering.comment()
         different_keys = [key for key in SHARED if values.get(key) != first_values.get(key)]
-        if texts := [f"{key} = {values.get(key, 'not set')}" for key in different_keys]:
-            LOG.warning("%s: has %s; the values of %s are used", name, ", ".join(texts), names[0])
+        if differences := [f"{key} = {values.get(key, 'not set')}" for key in different_keys]:
+            LOG.warning("%s: has %s; the values of %s are used", name, ", ".join(differences), names[0])
     models = [model.with_origin(origin) for model in models]
     if any(model.filter_variance is None for model in models):
         models = [model.baked() for model in models]
@@ -142,10 +142,10 @@ def read(sources: Sequence[Path]) -> Model:
     return merge_models(models, [str(source) for source in sources])
 
 
-def write_model(sources: Sequence[Path], model: Model, out: Path, writing: Writing) -> dict[str, Any]:
+def write_model(sources: Sequence[Path], model: Model, out: Path, options: Writing) -> dict[str, Any]:
     """Write a model that was read from `sources`, and return the same as `convert`.  Raises OutputError."""
     size = sum(model_bytes(model_path(source)) for source in sources)
-    model.save(out, writing)
+    model.save(out, options)
     kind = writing_format(out).name
     return {"file": str(out), "format": kind, "gaussians": len(model), "bytes": model_bytes(out), "bytes_read": size}
 

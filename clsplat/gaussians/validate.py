@@ -92,8 +92,8 @@ def lines(report: dict[str, Any]) -> str:
     for name, (low, median, high) in report["ranges"].items():
         rows.append(f"  {name:<12} {low:.4g} to {high:.4g}, median {median:.4g}")
     for low, high in [report["bounds"]] if report["bounds"] else []:
-        texts = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
-        rows.append(f"  {'bounds':<12} ({next(texts)}) to ({next(texts)})")
+        corners = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
+        rows.append(f"  {'bounds':<12} ({next(corners)}) to ({next(corners)})")
     if origin := report.get("origin"):
         rows.append(f"  {'origin':<12} {position_text(np.array(origin))}, to which the bounds are relative")
     counts = report["degenerate"]

@@ -31,8 +31,8 @@ def psnr(image: NDArray[np.generic], photograph: NDArray[np.generic], mask: Mask
     Raises ValueError for other types, for different shapes, and if all pixels are masked.
     """
     image, photograph = _check(image, photograph, mask)
-    squared = (image.astype(np.float64) - photograph) ** 2
-    error = float(np.mean(squared if mask is None else squared[mask])) / 255**2
+    squares = (image.astype(np.float64) - photograph) ** 2
+    error = float(np.mean(squares if mask is None else squares[mask])) / 255**2
     return MAX_PSNR if error == 0 else 10 * math.log10(1 / error)
 
 

@@ -186,8 +186,8 @@ def ms_ssim(image: Image, photograph: Image) -> float | None:
 def _halve(image: Floats) -> Floats:
     """Average blocks of 2 x 2 pixels; an odd last row or column is ignored."""
     height, width = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    even = image[:height, :width]
-    mean: Floats = (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
+    even_part = image[:height, :width]
+    mean: Floats = (even_part[::2, ::2] + even_part[1::2, ::2] + even_part[::2, 1::2] + even_part[1::2, 1::2]) / 4
     return mean
 
 

@@ -164,9 +164,9 @@ def color_metrics(
     truth, finite = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     full_mask = np.ones(truth.shape[:2], bool) if mask is None else mask
     fitted_image = fit_colors(finite, photograph, full_mask, model)
-    corrected = correct_by_regression(finite, truth, full_mask)
+    corrected_image = correct_by_regression(finite, truth, full_mask)
     color = {} if fitted_image is None else {"psnr_color": psnr(fitted_image, photograph, full_mask)}
-    return {**color, "psnr_affine": psnr(corrected, photograph, full_mask)}
+    return {**color, "psnr_affine": psnr(corrected_image, photograph, full_mask)}
 
 
 def mean_color_metrics(views: Sequence[dict[str, float]]) -> dict[str, Any]:
@@ -193,7 +193,7 @@ def fit_colors(
     others remain.
     """
     usable = mask & ((photograph > 0) & (photograph < 255)).all(axis=2)
-    half_width, truth, corrected = image.shape[1] // 2, photograph / 255.0, image.copy()
+    half_width, truth, result = image.shape[1] // 2, photograph / 255.0, image.copy()
     left, right = np.s_[:, :half_width], np.s_[:, half_width:]
     min_pixels = PIXELS_PER_PARAMETER * model.parameters_per_channel
     if min(np.count_nonzero(usable[half]) for half in (left, right)) < min_pixels:
@@ -202,8 +202,8 @@ def fit_colors(
         below_white = usable[fit_half] & (image[fit_half] < 1).all(axis=2)
         fit_mask = below_white if np.count_nonzero(below_white) >= min_pixels else usable[fit_half]
         matrix = model.fit_matrix(image[fit_half][fit_mask], truth[fit_half][fit_mask])
-        corrected[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
-    return corrected
+        result[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
+    return result
 
 
 def correct_by_regression(image: NDArray[np.float64], truth: NDArray[np.float64], mask: Mask) -> NDArray[np.float64]:
@@ -211,14 +211,14 @@ def correct_by_regression(image: NDArray[np.float64], truth: NDArray[np.float64]
 
     Noise makes the slope `a` too small, so this is not the least-squares correction of the image.
     """
-    corrected = image.copy()
+    corrected_image = image.copy()
     for channel in range(3):
         x, y = truth[..., channel][mask], image[..., channel][mask]
         variance = float(np.mean((x - x.mean()) ** 2))
         slope = float(np.mean((x - x.mean()) * (y - y.mean()))) / variance if variance > 0 else 1.0
         if abs(slope) > MIN_SLOPE:
-            corrected[..., channel] = (image[..., channel] - (y.mean() - slope * x.mean())) / slope
-    return np.clip(corrected, 0, 1)
+            corrected_image[..., channel] = (image[..., channel] - (y.mean() - slope * x.mean())) / slope
+    return np.clip(corrected_image, 0, 1)
 
 
 def log_color_metrics(averages: dict[str, Any]) -> None:
@@ -346,17 +346,17 @@ def measure(
         floats = render_floats(painter, photograph.camera, view.response)
         if finite:
             require_finite(floats, view)
-        rendered = to_8_bits(floats)
+        render = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted_pixels()
         color = color_metrics(floats, image, mask, colors) if colors else {}
-        static_psnr = flicker_meter.add(view, rendered, image, mask)
+        static_psnr = flicker_meter.add(view, render, image, mask)
         if mask is None:
-            similarity = device_ssim(painter.workspace, photograph, rendered)
+            similarity = device_ssim(painter.workspace, photograph, render)
         else:
-            rendered, image = rendered * mask[..., None], image * mask[..., None]
-            similarity = ssim(rendered, image, mask)
-        scores = perceptual.measure(rendered, image)
-        results.append(ViewMetrics(view.name, psnr(rendered, image, mask), similarity, scores, color, static_psnr))
+            render, image = render * mask[..., None], image * mask[..., None]
+            similarity = ssim(render, image, mask)
+        scores = perceptual.measure(render, image)
+        results.append(ViewMetrics(view.name, psnr(render, image, mask), similarity, scores, color, static_psnr))
         if results[-1].psnr < EMPTY_PSNR and painter.render_layers(photograph.camera).alpha.mean() < EMPTY_ALPHA:
             empty_names.append(view.name)
     if empty_names:

@@ -182,18 +182,18 @@ class Levels:
         )
         return edges
 
-    def _fine_edges(self, coarse: SampleLevel) -> Array:
-        samples, count = self.shape.fine_samples, coarse.rays.count
+    def _fine_edges(self, level: SampleLevel) -> Array:
+        samples, count = self.shape.fine_samples, level.rays.count
         edges = self.workspace.array("field fine edges", (count, samples + 1))
         self._rays.resample_edges(
             items=count,
-            weights=coarse.weights,
-            edges=coarse.edges,
+            weights=level.weights,
+            edges=level.edges,
             fine=edges,
-            samples=coarse.samples,
+            samples=level.samples,
             fine_samples=samples,
             count=count,
-            **_random_arguments(coarse.rays.draw),
+            **_random_arguments(level.rays.draw),
         )
         return edges
 

@@ -182,7 +182,7 @@ class Network:
         tiles, output_rows = grad_outputs.shape[:2]
         chunks = -(-tiles // CHUNK)
         count = chunks * (layer.rows // BLOCK) * (layer.columns // BLOCK)
-        shared: dict[str, Any] = {
+        arguments: dict[str, Any] = {
             "grad_outputs": grad_outputs,
             "partials": self._partials(tiles),
             "parameter_count": self.shape.network_parameters,
@@ -198,10 +198,10 @@ class Network:
             first_input=inputs.first,
             input_count=layer.rows,
             count=count,
-            **shared,
+            **arguments,
         )
         biases = chunks * layer.columns
-        self._program.dense_biases(items=biases, first_parameter=layer.first_bias, count=biases, **shared)
+        self._program.dense_biases(items=biases, first_parameter=layer.first_bias, count=biases, **arguments)
 
 
 # The encodings of samples that the network reads, and the gradient of the grid.
@@ -247,7 +247,7 @@ class Encoding:
             self._locate(samples)
             self.read_grid(parameters, samples.tiles)
         shape, (features, first) = self.shape, self.network.position(samples.tiles)
-        shared: dict[str, Any] = {
+        arguments: dict[str, Any] = {
             "items": samples.count // self._lanes,
             "cones": samples.cones,
             "samples": samples.samples_per_ray,
@@ -261,7 +261,7 @@ class Encoding:
                 first_row=first + shape.grid_rows,
                 degrees=shape.degrees,
                 written=round_to_blocks(6 * shape.degrees),
-                **shared,
+                **arguments,
             )
         features, first = self.network.direction(samples.tiles)
         self._program.encode_directions(
@@ -270,7 +270,7 @@ class Encoding:
             first_row=first,
             degrees=shape.direction_degrees,
             written=shape.direction_rows,
-            **shared,
+            **arguments,
         )
 
     def backward(self, grad_position: Array, gradient: Array) -> None:

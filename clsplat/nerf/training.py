@@ -177,10 +177,10 @@ class LearnedField(TrainedField):
         colors = photo.photograph.planes(self.field.workspace).colors
         scales = coarse_weight * scale, scale
         for first in range(0, photo.rays, count):
-            key = Draw(draw.seed, draw.step, draw.first + first)
-            rays = levels.sample_rays(photo.camera, key, min(count, photo.rays - first))
-            rendered = levels.render(self.field.parameters, rays)
-            for level, level_scale, squares in zip(rendered, scales, errors, strict=True):
+            rays_draw = Draw(draw.seed, draw.step, draw.first + first)
+            rays = levels.sample_rays(photo.camera, rays_draw, min(count, photo.rays - first))
+            sample_levels = levels.render(self.field.parameters, rays)
+            for level, level_scale, squares in zip(sample_levels, scales, errors, strict=True):
                 target = RayTarget(colors, level_scale, squares)
                 levels.differentiate(self.field.parameters, level, target, self._gradient)
 

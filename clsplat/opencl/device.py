@@ -488,10 +488,10 @@ class Program:
                 f"kernels may be damaged: remove {kernel_caches()}"
             ) from error
         names = program.get_info(cl.program_info.KERNEL_NAMES).split(";")
-        if unparsed := sorted({name for name in names if name} - self.kernels.keys()):
+        if unparsed_names := sorted({name for name in names if name} - self.kernels.keys()):
             raise KernelError(
-                f"{path}: cannot parse the declaration of {', '.join(unparsed)}; expected "
-                f"'__kernel __attribute__((reqd_work_group_size(64, 1, 1))) void {unparsed[0]}(' "
+                f"{path}: cannot parse the declaration of {', '.join(unparsed_names)}; expected "
+                f"'__kernel __attribute__((reqd_work_group_size(64, 1, 1))) void {unparsed_names[0]}(' "
                 "and parameters like '__global const float *restrict means' and 'const uint count'"
             )
 

@@ -157,8 +157,8 @@ def _add_intel_runtime() -> None:
     for file in folder.glob("*.icd"):
         if file.name != "intel-pip.icd" and not (SYSTEM_DRIVERS / file.name).exists():
             file.unlink(missing_ok=True)
-    texts = {driver.name: driver.read_text("utf-8", errors="replace") for driver in SYSTEM_DRIVERS.glob("*.icd")}
-    for name, text in {**texts, "intel-pip.icd": f"{library}\n"}.items():
+    contents = {driver.name: driver.read_text("utf-8", errors="replace") for driver in SYSTEM_DRIVERS.glob("*.icd")}
+    for name, text in {**contents, "intel-pip.icd": f"{library}\n"}.items():
         if not (folder / name).exists() or (folder / name).read_text("utf-8", errors="replace") != text:
             write_text(folder / name, text)
     os.environ["OCL_ICD_VENDORS"] = str(folder)

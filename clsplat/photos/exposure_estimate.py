@@ -68,23 +68,23 @@ def exif_exposures(views: Sequence[View]) -> Exposures:
     return Exposures(gains, "by EXIF")
 
 
-def complete_exposures(measured: Exposures, exif: Exposures) -> Exposures:
+def complete_exposures(base: Exposures, exif: Exposures) -> Exposures:
     """Add exposures from EXIF for photographs without exposures measured on tracks.
 
     Exposures from EXIF are shifted by the mean difference over the photographs that have both kinds.  If no photograph
     has both, exposures from EXIF are not used.
     """
-    if not measured.log_gains:
+    if not base.log_gains:
         return exif
-    shared_names = [name for name in exif.log_gains if name in measured.log_gains]
-    new_names = [name for name in exif.log_gains if name not in measured.log_gains]
+    shared_names = [name for name in exif.log_gains if name in base.log_gains]
+    new_names = [name for name in exif.log_gains if name not in base.log_gains]
     if not shared_names or not new_names:
-        return measured
-    offset = np.mean([measured.log_gains[name] - exif.log_gains[name] for name in shared_names], axis=0)
-    combined = {**measured.log_gains, **{name: exif.log_gains[name] + offset for name in new_names}}
-    mean = np.mean(list(combined.values()), axis=0)
-    source = f"{measured.source}, those of {len(new_names)} {exif.source}"
-    return Exposures({name: gains - mean for name, gains in combined.items()}, source, measured.explained_variance)
+        return base
+    offset = np.mean([base.log_gains[name] - exif.log_gains[name] for name in shared_names], axis=0)
+    log_gains = {**base.log_gains, **{name: exif.log_gains[name] + offset for name in new_names}}
+    mean = np.mean(list(log_gains.values()), axis=0)
+    source = f"{base.source}, those of {len(new_names)} {exif.source}"
+    return Exposures({name: gains - mean for name, gains in log_gains.items()}, source, base.explained_variance)
 
 
 def measure_exposures(tracks: Tracks, views: Iterable[View], read: PhotographReader) -> Exposures:
@@ -160,9 +160,9 @@ def _corrections(photograph: Integers, point: Integers, target: Floats, weights:
     solution, residual = np.zeros(count), apply(target)
     direction, squared_norm = residual.copy(), float((residual**2).sum())
     rounding = ROUNDING * np.bincount(photograph, weights, minlength=count)
-    goal = max(TOLERANCE**2 * squared_norm, float((rounding**2).sum()))
+    tolerance = max(TOLERANCE**2 * squared_norm, float((rounding**2).sum()))
     for _ in range(count):
-        if squared_norm <= goal:
+        if squared_norm <= tolerance:
             break
         product = apply(direction[photograph])
         step = squared_norm / float((direction * product).sum())

@@ -157,5 +157,5 @@ class Sampler:
     def at(self, step: int) -> Sample:
         """Return the sample of a global step, counted from 1."""
         view, divisor = self.settings.order.view_at(self._pool, step), self.settings.divisor(step)
-        resized = view.resized(view.downscale * divisor)
-        return Sample(resized, view, self._indices[id(view)], self.settings.transforms, step)
+        resized_view = view.resized(view.downscale * divisor)
+        return Sample(resized_view, view, self._indices[id(view)], self.settings.transforms, step)

@@ -82,8 +82,8 @@ class LocalExecution(Settings):
 
     def _unused_keys(self) -> dict[str, str]:
         """Return the keys that have no effect, each with a reason."""
-        unused = {} if self.has_store else dict.fromkeys(STORE_KEYS, "it needs a store")
-        return unused if self.engine == "local" else unused | {"packing": "it applies only to engine local"}
+        reasons = {} if self.has_store else dict.fromkeys(STORE_KEYS, "it needs a store")
+        return reasons if self.engine == "local" else reasons | {"packing": "it applies only to engine local"}
 
     @property
     def has_store(self) -> bool:
@@ -124,14 +124,14 @@ class Execution(LocalExecution):
         return self
 
     def _unused_keys(self) -> dict[str, str]:
-        unused = super()._unused_keys()
+        reasons = super()._unused_keys()
         if self.has_workers:
-            unused["devices"] = "the workers choose the devices they offer"
+            reasons["devices"] = "the workers choose the devices they offer"
         if not self.engine.startswith("tls://"):
-            unused["tls"] = "it applies only to engine tls://HOST:PORT"
+            reasons["tls"] = "it applies only to engine tls://HOST:PORT"
         if not self.engine.startswith("dask://"):
-            unused["insecure"] = "it applies only to engine dask://HOST:PORT"
-        return unused
+            reasons["insecure"] = "it applies only to engine dask://HOST:PORT"
+        return reasons
 
     @property
     def has_store(self) -> bool:

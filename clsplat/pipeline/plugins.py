@@ -114,16 +114,16 @@ def differences(recorded: Mapping[str, str]) -> list[str]:
 def digest_of(*modules: Path) -> str:
     """Return the SHA-256 of Python files and of the kernel files and headers next to them that they name."""
     digest, queue = sha256(), list(dict.fromkeys(modules))
-    visited = set(queue)
+    visited_files = set(queue)
     while queue:
         file = queue.pop(0)
         content = read_file(file, "a file of a plug-in", ConfigError)
         digest.update(f"{file.name}\n{len(content)}\n".encode() + content)
         references = {file.parent / name for name in _KERNEL_FILE.findall(content.decode("utf-8", "replace"))}
         references |= {file.with_suffix(".cl")} if file in modules else set()
-        new_files = sorted(path for path in references if path not in visited and path.is_file())
+        new_files = sorted(path for path in references if path not in visited_files and path.is_file())
         queue += new_files
-        visited.update(new_files)
+        visited_files.update(new_files)
     return digest.hexdigest()
 
 

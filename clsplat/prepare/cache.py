@@ -155,7 +155,7 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
         else:
             shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True, exist_ok=True)
-        figures = planned_step.step.make(source.resolve(), temporary, root.parent)
+        result = planned_step.step.make(source.resolve(), temporary, root.parent)
         seconds = round(time.perf_counter() - start, 1)
         settings = planned_step.step.model_dump(mode="json")
         record = {
@@ -163,7 +163,7 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
             "inputs": planned_step.inputs,
             "settings": settings,
             "seconds": seconds,
-            **figures,
+            **result,
         }
         sync_below(temporary)
         write_text(temporary / RECORD, json.dumps({**record, "files": _sizes(temporary)}, indent=1) + "\n")
@@ -181,7 +181,7 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
         ):  # name the user's folder, not a result
             raise DataError(str(error).replace(str(source.resolve() / IMAGES), planned_step.origin)) from error
         raise
-    LOG.info("%s (%.0f s)", planned_step.step.summary(figures), seconds)
+    LOG.info("%s (%.0f s)", planned_step.step.summary(result), seconds)
 
 
 def read_record(folder: Path) -> dict[str, Any]:

@@ -65,8 +65,8 @@ def find_features(
     pycolmap = require_pycolmap()
     names, read_errors = gather(photographs, out / IMAGES, list_photographs(photographs, excluded_folder))
     groups = group_photos(out / IMAGES, names, cameras)
-    figures = {"photographs": len(names), "cameras": len(groups), "damaged": read_errors}
-    log_warnings(figures)
+    result = {"photographs": len(names), "cameras": len(groups), "damaged": read_errors}
+    log_warnings(result)
     if camera_model != "EQUIRECTANGULAR" and all(_is_panorama(out / IMAGES / group[0]) for group in groups):
         LOG.warning(
             "the photos are twice as wide as high, like panoramas; "
@@ -79,7 +79,7 @@ def find_features(
             remove_database(out / DATABASE)
             _register(pycolmap, out, groups, camera_model)
     add_features(out / IMAGES, out / DATABASE, options)
-    return figures
+    return result
 
 
 def _is_panorama(photograph: Path) -> bool:

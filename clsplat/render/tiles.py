@@ -186,8 +186,8 @@ class Tiler:
 
     def _runs(self, count: int, min_run: int) -> tuple[int, int]:
         """Return the number of values per item, and the number of groups."""
-        balanced = -(-count // (4 * self.device.info.units))  # four runs per core balance the load
-        run = 8 if self._team > 1 else max(min_run, balanced)
+        balanced_run = -(-count // (4 * self.device.info.units))  # four runs per core balance the load
+        run = 8 if self._team > 1 else max(min_run, balanced_run)
         return run, -(-count // (run * self._team))
 
     def _depth_order(self, depth_key: Array, count: int) -> Array:

@@ -128,8 +128,8 @@ class ModelSource:
 
     def scene(self, model: Model | FieldModel) -> Scene:
         """Read the scene at full image size, with the masks and alpha mode that the model was trained with."""
-        masked = self.settings.apply_masks(read_scene(self.folder, self.settings.split))
-        return masked.with_alpha(self.alpha or model.rendering.alpha)
+        masked_scene = self.settings.apply_masks(read_scene(self.folder, self.settings.split))
+        return masked_scene.with_alpha(self.alpha or model.rendering.alpha)
 
 
 def require_model(path: Path) -> None:

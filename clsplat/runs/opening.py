@@ -59,17 +59,17 @@ class RunScene:
         Raises DataError, which names the files, if photos or masks cannot be used.
         """
         original, background = settings.apply(scene)
-        downscaled = original.downscaled(*settings.downscales)
+        downscaled_scene = original.downscaled(*settings.downscales)
         LOG.info(
             "scene: %s, %d training%s and %d test views, %s px, %s background, extent %.3g",
             *(
                 scene.path,
-                len(downscaled.train),
-                f", {len(downscaled.validation)} validation" if downscaled.validation else "",
-                len(downscaled.test),
-                downscaled.image_sizes,
+                len(downscaled_scene.train),
+                f", {len(downscaled_scene.validation)} validation" if downscaled_scene.validation else "",
+                len(downscaled_scene.test),
+                downscaled_scene.image_sizes,
                 background,
-                downscaled.extent,
+                downscaled_scene.extent,
             ),
         )
         if len(original.train) < MIN_VIEWS:
@@ -78,13 +78,13 @@ class RunScene:
                 *(scene.path, pluralize(len(original.train), "photo")),
             )
         files = decode_all(
-            view for version in (original, downscaled) for split in SPLITS for view in version.split(split)
+            view for version in (original, downscaled_scene) for split in SPLITS for view in version.split(split)
         )
         require_decodable(scene.path, files)
         if blank := require_content(scene.path, original.split("train"), files):
             count = pluralize(len(blank), "photo")
             LOG.warning("%s: %s: black, of a single color, or transparent: %s", scene.path, count, first_few(blank))
-        return cls(original, downscaled, background, Identity.from_scene(original, files))
+        return cls(original, downscaled_scene, background, Identity.from_scene(original, files))
 
 
 ReadScene = Callable[[SceneSettings, Path], RunScene]

@@ -130,11 +130,11 @@ def verify(state: RunState) -> dict[str, Any]:
     cells: dict[str, RunState] = {}
     objects = list(_check_files(state, cells))
     bad_files = [entry["file"] for entry in objects if not entry["whole"]]
-    verified = {"run": str(out), "state": state.state_name, "whole": not bad_files, "objects": objects}
+    result = {"run": str(out), "state": state.state_name, "whole": not bad_files, "objects": objects}
     if bad_files:
         cell = cells.get(bad_files[0].partition("/")[0])
-        verified["remedy"] = _remedy(cell if cell and cell.phase else state, verified)
-    return verified
+        result["remedy"] = _remedy(cell if cell and cell.phase else state, result)
+    return result
 
 
 def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool = False) -> Iterator[dict[str, Any]]:

@@ -378,8 +378,8 @@ class Lens:
         """Undistort a photograph, [H, W, C], to the camera `pinhole`; the data type does not change."""
         if self.is_wide:
             return self._extract_face(pixels)
-        undistorted = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return undistorted.reshape(self.pinhole.height, self.pinhole.width, -1)
+        result = cv2.remap(pixels, *_maps(self), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return result.reshape(self.pinhole.height, self.pinhole.width, -1)
 
     @cached_property
     def shown(self) -> NDArray[np.bool_]:

@@ -117,12 +117,12 @@ def _best_planes(
         for j in neighbors:
             matrix = _homography(view, views[j], depth)
             size = view.camera.width, view.camera.height
-            warped = cv2.warpPerspective(
+            warped_image = cv2.warpPerspective(
                 images[j], matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderValue=(9, 9, 9)
             )
-            differences.append(cv2.blur(np.minimum(np.abs(warped - image).sum(axis=2), 1), (WINDOW, WINDOW)))
-        stacked = np.sort(np.stack(differences), axis=0) if differences else np.ones((1, *image.shape[:2]))
-        costs[plane] = stacked[: -(-len(stacked) // 2)].mean(axis=0)
+            differences.append(cv2.blur(np.minimum(np.abs(warped_image - image).sum(axis=2), 1), (WINDOW, WINDOW)))
+        sorted_differences = np.sort(np.stack(differences), axis=0) if differences else np.ones((1, *image.shape[:2]))
+        costs[plane] = sorted_differences[: -(-len(sorted_differences) // 2)].mean(axis=0)
     return np.where(costs.min(axis=0) < MAX_COST_RATIO * costs.mean(axis=0), costs.argmin(axis=0), 0)
 
 

@@ -46,9 +46,9 @@ def make_clock(path: object, moments: Sequence[tuple[str, float | None]]) -> Clo
     values = [value for _, value in moments if value is not None]
     if not values:
         return None
-    if untimed := [name for name, value in moments if value is None]:
+    if names := [name for name, value in moments if value is None]:
         raise DataError(
-            f"{path}: {len(untimed)} of {len(moments)} frames have no `time`: {first_few(untimed)}; expected a time in "
+            f"{path}: {len(names)} of {len(moments)} frames have no `time`: {first_few(names)}; expected a time in "
             "every frame or in none: add the missing ones, or remove all for a static scene"
         )
     first, last = min(values), max(values)

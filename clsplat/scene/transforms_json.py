@@ -360,8 +360,8 @@ class NerfstudioReader(Reader):
         clock = make_clock(transforms.path, transforms.moments())
         files = FrameFiles(self.root or path, path, transforms.frames)
         views = sorted(files.views(transforms.path, self.missing, clock), key=lambda view: view.name)
-        renamed = dict(zip(files.listing, files.names, strict=True))
-        train, test = (_read_list(transforms, key, renamed) for key in ("train_filenames", "test_filenames"))
+        new_names = dict(zip(files.listing, files.names, strict=True))
+        train, test = (_read_list(transforms, key, new_names) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             test = {views[i].name for i in every_nth([view.name for view in views], holdout)}
         split_views = views if train is None else [view for view in views if view.name in train | (test or set())]
@@ -373,10 +373,10 @@ class NerfstudioReader(Reader):
         list_frames(parts, self.root or parts.path, TRANSFORMS_FILE)
 
 
-def _read_list(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> set[str] | None:
+def _read_list(transforms: Transforms, key: str, new_names: Mapping[str, str]) -> set[str] | None:
     """Return the view names in the list `key` of a file, or None if there is no such list.  Raises DataError.
 
-    renamed: maps names in the file to the names of the views.
+    new_names: maps names in the file to the names of the views.
     """
     entries = transforms.table.get(key)
     if entries is None:
@@ -384,12 +384,12 @@ def _read_list(transforms: Transforms, key: str, renamed: Mapping[str, str]) -> 
     if not isinstance(entries, list) or not all(isinstance(entry, str) for entry in entries):
         raise DataError(f"{transforms.path}: {key} is not a list of file paths; export the file again")
     names = {view_name(entry) for entry in entries}
-    unknown = sorted(names - renamed.keys())
-    if unknown:
+    unknown_names = sorted(names - new_names.keys())
+    if unknown_names:
         raise DataError(
-            f"{transforms.path}: {key} lists {quote(unknown[0])}, which no frame has; remove it from the list"
+            f"{transforms.path}: {key} lists {quote(unknown_names[0])}, which no frame has; remove it from the list"
         )
-    return {renamed[name] for name in names}
+    return {new_names[name] for name in names}
 
 
 # Read the multi-scale Blender datasets of mip-NeRF: one metadata.json, and every photograph at several sizes.

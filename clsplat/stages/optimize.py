@@ -95,8 +95,8 @@ class ValidatedTraining(Training):
 
         The evaluations of `keep: best` come first, since they may end the training.
         """
-        ordered = sorted(during, key=lambda stage: not _validates(stage)) if self.keep == "best" else during
-        return [*self.measurements(during), *ordered]
+        ordered_stages = sorted(during, key=lambda stage: not _validates(stage)) if self.keep == "best" else during
+        return [*self.measurements(during), *ordered_stages]
 
     def reset_best(self, run: Run) -> None:
         """Remove the best model of an earlier training.  Raises ConfigError if there are no validation views."""
@@ -363,13 +363,13 @@ class Optimize(ValidatedTraining):
             stage.attach(run)
         offload_harmonics(run)
         run.adam = run.adam or Adam(gaussians)
-        parts = run.rasterizer, run.model, run.adam, run.stats, photographs.background
+        context = run.rasterizer, run.model, run.adam, run.stats, photographs.background
         rates = self.rates.resolve(views.full_size(last_step))
         states: list[ModuleState] = attach_modules(self.modules, run, last_step)
         if self.views_per_update != 1:
             attach_gradients(gaussians)
         settings = self.losses, rates, run.scene.extent, self.update, self.views_per_update
-        return StepTrainer(*parts, *settings, modules=states)
+        return StepTrainer(*context, *settings, modules=states)
 
     def _edit(self, run: Run, views: ViewSettings) -> None:
         """Run the edits due at the previous step."""

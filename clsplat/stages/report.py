@@ -201,10 +201,10 @@ def views(run: Run) -> dict[str, list[ViewFigure]]:
     """Return images of the best and the worst views of the last evaluation, by heading."""
     by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
     lines = [r for r in run.records.read("view") if r["downscale"] == run.downscale and r["step"] == run.model_step]
-    last = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice at the same step
-    ranked = sorted(last.values(), key=lambda r: r["psnr"])
-    worst = ranked[:MAX_VIEWS]
-    best = [r for r in reversed(ranked) if r not in worst][:MAX_VIEWS]
+    latest = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice at the same step
+    ranking = sorted(latest.values(), key=lambda r: r["psnr"])
+    worst = ranking[:MAX_VIEWS]
+    best = [r for r in reversed(ranking) if r not in worst][:MAX_VIEWS]
     groups = {"The best views": best, "The worst views": worst}
 
     def figure(record: dict[str, Any]) -> ViewFigure:

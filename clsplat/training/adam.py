@@ -69,8 +69,8 @@ class Rates(Settings):
     def times(self, factor: float) -> "Rates":
         """Return all rates multiplied by a factor."""
         values = {name: getattr(self, name) for name in PARAMETERS}
-        scaled = {name: _scale_rate(value, factor) for name, value in values.items()}
-        return self.model_copy(update={**scaled, "motion": self.motion.times(factor)})
+        scaled_values = {name: _scale_rate(value, factor) for name, value in values.items()}
+        return self.model_copy(update={**scaled_values, "motion": self.motion.times(factor)})
 
     def resolve(self, full_size: int) -> "Rates":
         """Return rates that depend only on the step.  full_size: the first global step with full-size photographs."""

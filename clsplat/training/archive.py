@@ -47,8 +47,8 @@ def read(path: Path) -> tuple[Notes, Arrays]:
             _require_sizes(archive, path.stat().st_size)
             notes = _notes(archive)
             digests = notes.pop(DIGESTS)
-            expected = sorted(f"{name}.npy" for name in (*digests, META, META_DIGEST))
-            if sorted(archive.namelist()) != expected:
+            expected_names = sorted(f"{name}.npy" for name in (*digests, META, META_DIGEST))
+            if sorted(archive.namelist()) != expected_names:
                 raise DataError("its list of contents has changed")
             return notes, {name: _array(_member(archive, name, digest)) for name, digest in digests.items()}
     except MemoryError:

@@ -32,8 +32,8 @@ class Scores(BaseModel):
 
     def text(self, views: str) -> str:
         """Return a sentence with the scores.  views: name of the views that were not used in training."""
-        figures = f"{self.train:.1f} dB at training views and {self.validation:.1f} dB at {views} views"
-        return f"At step {self.step:,} the model has {figures}{self.overfit_text()}."
+        psnrs = f"{self.train:.1f} dB at training views and {self.validation:.1f} dB at {views} views"
+        return f"At step {self.step:,} the model has {psnrs}{self.overfit_text()}."
 
     def overfit_text(self, first: "Scores | None" = None) -> str:
         """Return a clause that says that the model overfits, else "".  first: scores of the first model that did."""
@@ -85,8 +85,8 @@ class Best(BaseModel):
     def text(self) -> str:
         """Return a few sentences about the outcome."""
         best, last = self.measured, self.last
-        figures = f"{best.train:.1f} dB at training views and {best.validation:.1f} dB at validation views"
-        text = f"By the validation views, the model of step {best.step:,} is the best: {figures}{best.overfit_text()}."
+        psnrs = f"{best.train:.1f} dB at training views and {best.validation:.1f} dB at validation views"
+        text = f"By the validation views, the model of step {best.step:,} is the best: {psnrs}{best.overfit_text()}."
         if last.step != best.step:
             overfit = last.overfit_text(self.first_overfit)
             text += f" At step {last.step:,} it is {last.train:.1f} and {last.validation:.1f} dB{overfit}."

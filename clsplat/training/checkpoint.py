@@ -345,9 +345,9 @@ def load(path: Path) -> tuple[State, Arrays]:
 
 def _check_metrics(metrics: Metrics) -> None:
     """Raise DataError if metrics are invalid.  All values are numbers, except reasons and the origin of LPIPS."""
-    averages = [figures for by_downscale in metrics.values() for figures in by_downscale.values()]
-    values = [x for figures in averages for name, x in figures.items() if not re.search("_reason$|lpips_", name)]
-    is_complete = all(figures.get(name) is not None for figures in averages for name in ("psnr", "ssim", "views"))
+    averages = [average for by_downscale in metrics.values() for average in by_downscale.values()]
+    values = [x for average in averages for name, x in average.items() if not re.search("_reason$|lpips_", name)]
+    is_complete = all(average.get(name) is not None for average in averages for name in ("psnr", "ssim", "views"))
     if not (metrics.keys() <= set(SPLITS) and is_complete and all(isinstance(x, int | float | None) for x in values)):
         raise DataError("its metrics are not those of a run")
 

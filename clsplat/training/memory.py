@@ -59,11 +59,11 @@ class MemoryPlan:
     def text(self, gaussians: int) -> str:
         """Return a line with the required memory and the number of Gaussians that fit."""
         mib = 2**20
-        on_host = f"; harmonics take {gaussians * self.host / mib:,.0f} MiB on the host" if self.host else ""
+        host_text = f"; harmonics take {gaussians * self.host / mib:,.0f} MiB on the host" if self.host else ""
         return (
             f"memory: {self.required_bytes(gaussians) / mib:,.0f} MiB for {gaussians:,} Gaussians ({self.gaussian} "
             f"bytes each and {self.pair} per pair, photos and planes {self.fixed / mib:,.0f} MiB); {self.limit:,} "
-            f"fit in {self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{on_host}"
+            f"fit in {self.memory / mib:,.0f} MiB with buffers up to {self.allocation / mib:,.0f} MiB{host_text}"
         )
 
     def check(self, gaussians: int, more: str = "") -> None:

@@ -73,7 +73,7 @@ def update_motion(
     beta1, beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
     min_duration = math.log(rates["min_duration"]) if rates["min_duration"] else -MAX_LOG_DURATION
     bounds = {"log_duration": (min_duration, MAX_LOG_DURATION)}
-    shared: dict[str, Any] = {
+    arguments: dict[str, Any] = {
         "motion": table.array,
         "gradient": gradients[MOTION],
         "moment1": gaussians[moment1],
@@ -88,7 +88,7 @@ def update_motion(
         lowest, highest = bounds.get(name, (-UNBOUNDED, UNBOUNDED))
         gaussians.device.program("motion.cl").motion_step(
             items=(-(-gaussians.count // int(gaussians.device.tuning["LANES"])), columns.stop - columns.start),
-            **shared,
+            **arguments,
             rate=rates[name] / (1 - beta1**updates),
             lowest=lowest,
             highest=highest,

@@ -40,7 +40,7 @@ class Records:
     def __init__(self, out: Path, require_lock: Callable[[], None] = lambda: None) -> None:
         """require_lock: raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
-        self._require_held = require_lock
+        self._require_lock = require_lock
         self.path, self.trial = out / RECORDS, out / TRIAL
         self.lines = 0  # number of lines in the state of the run, including buffered ones
         self.lines_at_stage = 0  # number of lines at the start of the stage, which a resumed run repeats
@@ -49,7 +49,7 @@ class Records:
     def move_to_trial(self) -> None:
         """Move all lines to trial.jsonl before a refit.  Raises OutputError if the file cannot be moved."""
         self.write()
-        self._require_held()
+        self._require_lock()
         with raising_output_error(self.trial):
             self.path.replace(self.trial)
         self.lines = 0
@@ -87,7 +87,7 @@ class Records:
         """
         if not self._pending:
             return
-        self._require_held()
+        self._require_lock()
         append(self.path, "".join(self._pending).encode())
         self._pending.clear()
 

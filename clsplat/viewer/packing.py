@@ -158,8 +158,8 @@ def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
     max_code = 2**BITS - 1
     codes = np.rint((smaller * np.sqrt(0.5) + 0.5) * max_code).clip(0, max_code).astype(np.uint32)
     shifts = np.array([2 * BITS, BITS, 0], np.uint32)
-    packed = (codes << shifts).sum(axis=1, dtype=np.uint32) | (largest.astype(np.uint32) << np.uint32(30))
-    return np.asarray(packed, "<u4")
+    words = (codes << shifts).sum(axis=1, dtype=np.uint32) | (largest.astype(np.uint32) << np.uint32(30))
+    return np.asarray(words, "<u4")
 
 
 def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArray[np.float16]:
@@ -181,13 +181,13 @@ def _motion_header(columns: int) -> dict[str, int]:
 
 def _value_table(values: NDArray[np.floating]) -> Floats:
     """Return a table of 256 ascending values, which are denser where `values` are denser."""
-    ordered = np.sort(np.asarray(values, np.float64), axis=None)
-    if not len(ordered) or ordered[0] == ordered[-1]:
-        return np.full(256, ordered[0] if len(ordered) else 0.0)
-    by_rank = np.linspace(0, 1, len(ordered))
-    by_value = (ordered - ordered[0]) / (ordered[-1] - ordered[0])
+    sorted_values = np.sort(np.asarray(values, np.float64), axis=None)
+    if not len(sorted_values) or sorted_values[0] == sorted_values[-1]:
+        return np.full(256, sorted_values[0] if len(sorted_values) else 0.0)
+    by_rank = np.linspace(0, 1, len(sorted_values))
+    by_value = (sorted_values - sorted_values[0]) / (sorted_values[-1] - sorted_values[0])
     position = RANK_WEIGHT * by_rank + (1 - RANK_WEIGHT) * by_value
-    return np.interp(np.linspace(0, 1, 256), position, ordered)
+    return np.interp(np.linspace(0, 1, 256), position, sorted_values)
 
 
 def _quantization_table(largest: float) -> Floats:

@@ -84,8 +84,8 @@ def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
 def coarse_pipeline(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
     """Return the pipeline of the coarse model with the scene, filters, and seed of the block pipeline."""
     data = pipeline.resolved()
-    shared = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}
-    return check_document(coarse.path, Document({**coarse.resolved(), **shared}))
+    settings = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}
+    return check_document(coarse.path, Document({**coarse.resolved(), **settings}))
 
 
 def without_start(pipeline: Pipeline) -> Pipeline:

@@ -149,10 +149,10 @@ class Blocks:
     def identity(self) -> dict[str, Any]:
         """Return the inputs that identify the folder: options, and hashes of photos, pipelines, and coarse model."""
         pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
-        texts = {
+        contents = {
             name: json.dumps(with_content_hashes(pipeline), sort_keys=True) for name, pipeline in pipelines.items()
         }
-        digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
+        digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in contents.items()}
         options = {"blocks": self.plan.blocks, "min_coverage": self.plan.min_coverage, "steps": self.plan.steps}
         model = {"model": sha256(self.coarse_file)} if self.coarse_file else {}
         return {**options, "photographs": self.scene.identity.digest, **model, **digests}

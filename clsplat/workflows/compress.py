@@ -69,12 +69,12 @@ class Ladder:
 
 def ordered_keeps(keeps: Sequence[float]) -> list[float]:
     """Return the unique fractions in descending order.  Raises ConfigError if there are none or one is invalid."""
-    ordered = sorted(set(keeps), reverse=True)
-    if not ordered or not all(0.01 <= keep <= 1 for keep in ordered):
+    fractions = sorted(set(keeps), reverse=True)
+    if not fractions or not all(0.01 <= keep <= 1 for keep in fractions):
         raise ConfigError("--keep: expected fractions of the Gaussians from 0.01 to 1, such as 1,0.7,0.5")
-    if len({round(100 * keep) for keep in ordered}) < len(ordered):
+    if len({round(100 * keep) for keep in fractions}) < len(fractions):
         raise ConfigError("--keep: expected fractions that differ by at least 0.01")
-    return ordered
+    return fractions
 
 
 # Targets: a size, or a loss in PSNR.

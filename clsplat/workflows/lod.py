@@ -134,14 +134,14 @@ def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
     cost = pair_cost(tables, first, second)
     order = np.lexsort((second, first, np.where(np.isfinite(cost), cost, np.inf)))
     is_free = bytearray(b"\1") * len(tables["means"])
-    selected = []
+    selected_rows = []
     for start in range(0, len(order), BLOCK):
         batch = order[start : start + BLOCK]
         for pair, i, j in zip(batch.tolist(), first[batch].tolist(), second[batch].tolist(), strict=True):
             if is_free[i] and is_free[j]:
                 is_free[i] = is_free[j] = 0
-                selected.append(pair)
-    return first[selected], second[selected]
+                selected_rows.append(pair)
+    return first[selected_rows], second[selected_rows]
 
 
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:

@@ -112,8 +112,8 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
         grids.learn(workspace, 1, device.upload(gradient), step)
         total = gradient.astype(np.float64) + grad_smoothness
         expected[1], moment1, moment2 = ref.adam_step(expected[1], total, moment1, moment2, step, rate)
-        updated = np.stack([photograph_grid(grids, values) for values in expected])
-        expected = ref.center_grids(updated).reshape(expected.shape)
+        new_grids = np.stack([photograph_grid(grids, values) for values in expected])
+        expected = ref.center_grids(new_grids).reshape(expected.shape)
     tables = {name: table.reshape(3, -1) for name, table in grids.tables().items()}
     for kernel in ("color_grid_update", "color_grid_center"):
         yield compare_max(kernel, f"grids, {label}", tables["values"], expected, 2e-6, floor=1.0)

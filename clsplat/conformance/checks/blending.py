@@ -61,9 +61,9 @@ def sum_pixels(
     planes[:3, : camera.height, : camera.width] = weights
     if texture is not None:
         planes[3, : camera.height, : camera.width] = texture
-    uploaded = None if texture is None else device.upload(planes[3])
+    texture_array = None if texture is None else device.upload(planes[3])
     rasterizer.workspace.array("pair_sums", (frame.lists.pairs, RECORD)).fill(np.nan)  # all must be overwritten
-    pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), count, uploaded)
+    pixel_sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), count, texture_array)
     return pixel_sums.get()[:, : model.gaussians.count].T.astype(np.float64)
 
 

@@ -24,9 +24,9 @@ def rendering(device: Device, rng: np.random.Generator) -> Results:
         sums = blending.sum_pixels(device, scene, weights)
         yield from blending.check_sum(scene, sums, weights, name)
     yield from projection.check_gradient(device, case, rng, label)
-    filtered = add_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
-    yield from projection.check_record(device, filtered, "30 filtered Gaussians")
-    yield from projection.check_gradient(device, filtered, rng, "30 filtered Gaussians")
+    filtered_case = add_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
+    yield from projection.check_record(device, filtered_case, "30 filtered Gaussians")
+    yield from projection.check_gradient(device, filtered_case, rng, "30 filtered Gaussians")
 
 
 @CHECKS.add("count_large", "emit_large", "project_forward")

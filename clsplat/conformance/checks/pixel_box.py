@@ -43,9 +43,9 @@ def projection_for_the_pixel_box(device: Device, rng: np.random.Generator) -> Re
         case, label = random_case(rng, count, **BOX), f"{count} Gaussians for the pixel's box"
         yield from check_record(device, case, label)
         yield from check_gradient(device, case, rng, label)
-    filtered = add_world_filter(random_case(rng, 30, **BOX), rng)
-    yield from check_record(device, filtered, "filtered Gaussians for the pixel's box")
-    yield from check_gradient(device, filtered, rng, "filtered Gaussians for the pixel's box")
+    filtered_case = add_world_filter(random_case(rng, 30, **BOX), rng)
+    yield from check_record(device, filtered_case, "filtered Gaussians for the pixel's box")
+    yield from check_gradient(device, filtered_case, rng, "filtered Gaussians for the pixel's box")
     yield from check_fused(device, rng, random_case(rng, 40, **BOX), "40 Gaussians for the pixel's box")
 
 

@@ -124,8 +124,8 @@ def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
         gradient = (rng.normal(size=expected.shape) / size).astype(np.float32)
         view.skies.update(view.sky, view.camera, device.upload(gradient), moments, 0.01)
         total = size * gradient.astype(np.float64)
-        updated, moment1, moment2 = ref.adam_step(expected, total, moment1, moment2, step, 0.01, epsilon=1.0)
-        expected = np.where(is_free, updated, expected)
+        new_values, moment1, moment2 = ref.adam_step(expected, total, moment1, moment2, step, 0.01, epsilon=1.0)
+        expected = np.where(is_free, new_values, expected)
     actual = view.sky.texels.get()
     yield compare_max("sky_update", "colors of texels", actual[:, visible], expected, 1e-6, floor=1.0)
     for name, moment in (("moment1", moment1), ("moment2", moment2)):

@@ -97,18 +97,18 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
     lists, tiles, count = frame.lists, frame.camera.tiles, len(case.parameters["means"])
     keys = rasterizer.workspace.array("depth_key", count, np.uint32).get()
     splats, offsets = lists.pair_splat.get()[: lists.pairs], lists.tile_offset.get()[: tiles + 1]
-    ordered = splats[np.minimum(lists.tile_pairs.get()[: lists.pairs], max(lists.pairs, 1) - 1)]
+    tile_splats = splats[np.minimum(lists.tile_pairs.get()[: lists.pairs], max(lists.pairs, 1) - 1)]
     kernel = "find_tile_offsets" if sort == "radix" else "count_pairs"
     yield count_true(kernel, f"offsets of tiles, {label}", np.diff(offsets.astype(np.int64), append=lists.pairs) < 0)
     tile = np.repeat(np.arange(tiles), np.maximum(np.diff(offsets.astype(np.int64)), 0))[: lists.pairs]
     if len(tile) < lists.pairs:
         yield count_true(kernel, f"pairs outside all tiles, {label}", np.ones(lists.pairs - len(tile)))
         return
-    sorted_order = np.lexsort((ordered, keys[ordered], tile))
+    sorted_order = np.lexsort((tile_splats, keys[tile_splats], tile))
     kernel = "radix_scatter" if sort == "radix" else "sort_tiles"
     yield match(kernel, f"order in tiles, {label}", sorted_order, np.arange(lists.pairs))
     list_counts = np.zeros((tiles, count), int)
-    np.add.at(list_counts, (tile, ordered), 1)
+    np.add.at(list_counts, (tile, tile_splats), 1)
     yield count_true("emit_pairs", f"pairs listed twice, {label}", list_counts > 1)
     max_alpha, is_decisive = _max_alpha(frame, case)
     yield count_true("emit_pairs", f"missing pairs, {label}", (max_alpha >= 1.0001 / 255) & (list_counts == 0))

@@ -23,16 +23,16 @@ def color_grid_backward(
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the gradients of sum(gradient * output) with respect to image and grid, zero through clamped values."""
     upstream = np.where(unclamped_grid_colors(image, grid) < 1, gradient, 0)
-    grad_image, grad_grid, with_one = upstream.copy(), np.zeros(grid.shape), _to_homogeneous(image)
+    grad_image, grad_grid, homogeneous = upstream.copy(), np.zeros(grid.shape), _to_homogeneous(image)
     luminance = np.einsum("a,ahw->hw", WEIGHTS, image)
-    levels, inside = grid.shape[2] - 1, (luminance > 0) & (luminance < 1)
+    levels, is_inside = grid.shape[2] - 1, (luminance > 0) & (luminance < 1)
     for (k, j, i), weight, slope in _corners(image, grid):
         node = grid[:, :, k, j, i]  # [3, 4, H, W]
         grad_image += weight * np.einsum("abhw,ahw->bhw", node[:, :3], upstream)
-        grad_luminance = np.einsum("abhw,ahw,bhw->hw", node, upstream, with_one)
-        grad_image += WEIGHTS[:, None, None] * np.where(inside, levels * slope * grad_luminance, 0)
+        grad_luminance = np.einsum("abhw,ahw,bhw->hw", node, upstream, homogeneous)
+        grad_image += WEIGHTS[:, None, None] * np.where(is_inside, levels * slope * grad_luminance, 0)
         for a, b in itertools.product(range(3), range(4)):
-            np.add.at(grad_grid[a, b], (k, j, i), weight * upstream[a] * with_one[b])
+            np.add.at(grad_grid[a, b], (k, j, i), weight * upstream[a] * homogeneous[b])
     return grad_image, grad_grid
 
 
@@ -95,8 +95,8 @@ def color_matrix_backward(
     """Return the gradients of sum(gradient * output) with respect to image and matrix, zero through clamped values."""
     upstream = np.where(_transform(image, matrix) < 1, gradient, 0)
     grad_image = np.einsum("ab,ahw->bhw", matrix[:, :3], upstream)
-    with_one = np.concatenate([image, np.ones((1, *image.shape[1:]))])
-    return grad_image, np.einsum("ahw,bhw->ab", upstream, with_one)
+    homogeneous = np.concatenate([image, np.ones((1, *image.shape[1:]))])
+    return grad_image, np.einsum("ahw,bhw->ab", upstream, homogeneous)
 
 
 def gain_matrix(exposure: float, red: float, blue: float) -> NDArray[Any]:
@@ -172,6 +172,6 @@ def _locate_quarter(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 def _curve(x: NDArray[Any], slopes: NDArray[Any]) -> NDArray[Any]:
     """Return the integral from 0 of slopes that are linear between quarters, and constant below 0 and above 1."""
     quarter, d = _locate_quarter(x)
-    at_start = np.concatenate([[0], np.cumsum(slopes[1:] + slopes[:-1]) / 8])[quarter]
-    inside = at_start + slopes[quarter] * d + 2 * (slopes[quarter + 1] - slopes[quarter]) * d**2
-    return np.asarray(inside + slopes[0] * np.minimum(x, 0) + slopes[4] * np.maximum(x - 1, 0))
+    start_value = np.concatenate([[0], np.cumsum(slopes[1:] + slopes[:-1]) / 8])[quarter]
+    value = start_value + slopes[quarter] * d + 2 * (slopes[quarter + 1] - slopes[quarter]) * d**2
+    return np.asarray(value + slopes[0] * np.minimum(x, 0) + slopes[4] * np.maximum(x - 1, 0))

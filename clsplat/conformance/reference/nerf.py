@@ -180,8 +180,8 @@ def encode_frustums(means: Floats, variances: Floats, degrees: int) -> Floats:
     """Return the expected sines, then cosines, of 2^l x in each frustum, [R, N, 6 degrees] (equations 13 and 14)."""
     scales = 2.0 ** np.arange(degrees)[:, None]
     angles = (means[..., None, :] * scales).reshape(*means.shape[:-1], -1)
-    falls = np.exp(-0.5 * (variances[..., None, :] * scales**2)).reshape(angles.shape)
-    return np.concatenate([falls * np.sin(angles), falls * np.cos(angles)], axis=-1)
+    falloffs = np.exp(-0.5 * (variances[..., None, :] * scales**2)).reshape(angles.shape)
+    return np.concatenate([falloffs * np.sin(angles), falloffs * np.cos(angles)], axis=-1)
 
 
 def encode_directions(rays: Floats, degrees: int) -> Floats:

@@ -30,11 +30,11 @@ def adam_step(
     second = beta2 * moment2 + (1 - beta2) * grad**2
     mean = first / (1 - beta1**step)
     square = second / (1 - beta2**step)
-    updated = parameter - rate * mean / (np.sqrt(square) + epsilon)
+    new_parameter = parameter - rate * mean / (np.sqrt(square) + epsilon)
     if seen is None:
-        return updated, first, second
+        return new_parameter, first, second
     rows = seen.reshape(-1, *[1] * (grad.ndim - 1))
-    return np.where(rows, updated, parameter), np.where(rows, first, moment1), np.where(rows, second, moment2)
+    return np.where(rows, new_parameter, parameter), np.where(rows, first, moment1), np.where(rows, second, moment2)
 
 
 # Penalties on scales and opacities, with their gradients with respect to log_scales and logit_opacity.

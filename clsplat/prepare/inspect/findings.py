@@ -121,8 +121,8 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
     photographs, colmap = facts.photos, facts.kind == "COLMAP"
     if facts.missing:
         fault = f"{len(facts.missing)} of {facts.registered} registered images are missing on disk"
-        skip = ", or skip them with --set scene.missing=skip" if len(facts.missing) < facts.registered else ""
-        yield Finding("error", f"{fault} ({_join(facts.missing)}){facts.hint}", f"restore the files{skip}")
+        hint = ", or skip them with --set scene.missing=skip" if len(facts.missing) < facts.registered else ""
+        yield Finding("error", f"{fault} ({_join(facts.missing)}){facts.hint}", f"restore the files{hint}")
     if photographs.unreadable:
         unreadable = _join(list(photographs.unreadable))
         reason = next(iter(photographs.unreadable.values())).partition(";")[0]
@@ -205,11 +205,11 @@ def _check_cameras(facts: Facts) -> Iterator[Finding]:
 
 
 def _check_poses(facts: Facts) -> Iterator[Finding]:
-    used, *unused = facts.submodels or {"": 0}
+    main, *unused = facts.submodels or {"": 0}
     if unused:
         parts = ", ".join(f"{name} with {facts.submodels[name]} images" for name in unused)
-        is_large = any(facts.submodels[name] > MAX_LEFT_OUT * facts.submodels[used] for name in unused)
-        fault = f"COLMAP made {len(facts.submodels)} models and only {used} ({facts.submodels[used]} images) is used"
+        is_large = any(facts.submodels[name] > MAX_LEFT_OUT * facts.submodels[main] for name in unused)
+        fault = f"COLMAP made {len(facts.submodels)} models and only {main} ({facts.submodels[main]} images) is used"
         remedy = f"not used: {parts}; colmap model_merger may merge models that share images"
         yield Finding("warning" if is_large else "note", fault, remedy)
     if facts.train is not None:

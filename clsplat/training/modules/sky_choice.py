@@ -45,8 +45,8 @@ def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModu
         return settings
     choice, reason = ("off", conflict) if conflict else _choose(background, run)
     LOG.log(logging.INFO if choice == "on" else logging.DEBUG, "model.background: %s, since %s", choice, reason)
-    resolved = background.model_copy(update={"chosen": choice, "reason": reason})
-    return settings.model_copy(update={"background": resolved})
+    new_background = background.model_copy(update={"chosen": choice, "reason": reason})
+    return settings.model_copy(update={"background": new_background})
 
 
 def start_sky(run: Run, source: Model | None) -> None:

@@ -147,26 +147,26 @@ def smooth(poses: Floats, frames: int, distance: float) -> Floats:
     poses: [V, 9], positions, targets at `distance`, and up vectors.
     """
     weights = np.repeat([1.0, 1.0, UP_WEIGHT * distance], 3)
-    scaled = poses * weights
-    steps = np.linalg.norm(np.diff(scaled, axis=0), axis=1)
+    weighted_poses = poses * weights
+    steps = np.linalg.norm(np.diff(weighted_poses, axis=0), axis=1)
     is_new = np.append(True, steps > 1e-9 * max(1e-30, float(steps.max(initial=0.0))))  # drop repeated poses
-    scaled = scaled[is_new]
-    if len(scaled) == 1:
+    weighted_poses = weighted_poses[is_new]
+    if len(weighted_poses) == 1:
         return np.repeat(poses[:1], frames, axis=0)
-    smoothing = len(scaled) * (SMOOTHING * float(np.median(steps[is_new[1:]]))) ** 2
+    smoothing = len(weighted_poses) * (SMOOTHING * float(np.median(steps[is_new[1:]]))) ** 2
     curve, _ = scipy.interpolate.splprep(
-        scaled.T, k=min(DEGREE, len(scaled) - 1), s=smoothing if len(scaled) > DEGREE else 0
+        weighted_poses.T, k=min(DEGREE, len(weighted_poses) - 1), s=smoothing if len(weighted_poses) > DEGREE else 0
     )
     return np.asarray(np.stack(scipy.interpolate.splev(np.linspace(0, 1, frames), curve), axis=1) / weights)
 
 
 def _nearest_neighbor_tour(distances: Floats) -> Indices:
     """Return a tour that starts at the first view and continues to the nearest unvisited view each time."""
-    tour, unvisited = [0], set(range(1, len(distances)))
-    while unvisited:
-        candidates = np.array(sorted(unvisited))
+    tour, unvisited_views = [0], set(range(1, len(distances)))
+    while unvisited_views:
+        candidates = np.array(sorted(unvisited_views))
         tour.append(int(candidates[distances[tour[-1], candidates].argmin()]))
-        unvisited.remove(tour[-1])
+        unvisited_views.remove(tour[-1])
     return np.array(tour)
 
 
