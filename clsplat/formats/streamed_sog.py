@@ -228,8 +228,8 @@ def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
     def node(rows: Rows) -> Node:
         span = np.ptp(means[rows], axis=0)
         if len(rows) > limits.splats or (span.max() > max_extent and len(rows) > limits.few):
-            ordered = rows[np.argsort(means[rows, int(span.argmax())], kind="stable")]
-            halves = node(ordered[: len(rows) // 2]), node(ordered[len(rows) // 2 :])
+            sorted_rows = rows[np.argsort(means[rows, int(span.argmax())], kind="stable")]
+            halves = node(sorted_rows[: len(rows) // 2]), node(sorted_rows[len(rows) // 2 :])
             low = np.minimum(*(half.low for half in halves))
             return Node(low, np.maximum(*(half.high for half in halves)), halves)
         low, high = (means[rows] - reach[rows]).min(axis=0), (means[rows] + reach[rows]).max(axis=0)

@@ -158,10 +158,10 @@ def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
         old_sky, models = _read(path) if path.is_file() else (None, {})
     except DataError:  # a damaged sky belongs to no model
         old_sky, models = None, {}
-    other_models = {name: hash_ for name, hash_ in models.items() if name != model.name and (sky or hash_ != digest)}
+    other_models = {name: value for name, value in models.items() if name != model.name and (sky or value != digest)}
     if sky:
-        is_same = old_sky is not None and np.array_equal(old_sky.texels, sky.texels)
-        sky.write(path, {**(other_models if is_same else {}), model.name: digest})
+        is_unchanged = old_sky is not None and np.array_equal(old_sky.texels, sky.texels)
+        sky.write(path, {**(other_models if is_unchanged else {}), model.name: digest})
     elif old_sky and other_models:
         old_sky.write(path, other_models)
     elif old_sky and models:

@@ -107,9 +107,9 @@ def check_rows(rows: NDArray[np.integer], count: int) -> NDArray[np.uint32]:
         raise ValueError(
             f"rows: expected integers [n], got {rows.dtype} {list(rows.shape)}; np.flatnonzero gives the rows of a mask"
         )
-    outside = rows[(rows < 0) | (rows >= count)]
-    if len(outside):
-        raise ValueError(f"rows: expected integers in [0, {count}), got {outside[0]}")
+    invalid_rows = rows[(rows < 0) | (rows >= count)]
+    if len(invalid_rows):
+        raise ValueError(f"rows: expected integers in [0, {count}), got {invalid_rows[0]}")
     counts = np.bincount(rows.astype(np.int64), minlength=1)
     if counts.max() > 1:
         raise ValueError(f"rows: expected each row once, got row {counts.argmax()} {counts.max()} times")

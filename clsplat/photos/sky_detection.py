@@ -123,12 +123,12 @@ def sky_mask(image: Image, points: NDArray[np.floating], unmasked: Mask) -> Mask
     return np.asarray(sky & unmasked & np.isin(labels, labels[0][candidates[0]]))
 
 
-def _blur(values: NDArray[np.float32], unmasked: Mask) -> NDArray[np.float32]:
+def _blur(values: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
     """Return the mean of the unmasked pixels in a square of 3 x 3 px around each pixel."""
-    if unmasked.all():
+    if mask.all():
         return np.asarray(cv2.blur(values, (3, 3)))
-    fractions = cv2.blur(unmasked.astype(np.float32), (3, 3))
-    return np.asarray(cv2.blur(values * unmasked, (3, 3)) / np.maximum(fractions, 0.1), np.float32)
+    fractions = cv2.blur(mask.astype(np.float32), (3, 3))
+    return np.asarray(cv2.blur(values * mask, (3, 3)) / np.maximum(fractions, 0.1), np.float32)
 
 
 def _far_from_points(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:

@@ -88,14 +88,14 @@ def hull_points(
     cells: Cells = np.argwhere(~is_full)
     while True:
         centers, side = _centers(cells, center, half_side, resolution)
-        inside, cut = _classify(silhouettes, centers, HALF_DIAGONAL * side)
-        is_full[tuple(cells[inside].T)] = True
+        is_inside, cut = _classify(silhouettes, centers, HALF_DIAGONAL * side)
+        is_full[tuple(cells[is_inside].T)] = True
         cells, resolution = _split(cells[cut]), 2 * resolution
         is_full = is_full.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
         if cut.sum() >= count or resolution == FINEST:
             break
-    inside, _ = _classify(silhouettes, _centers(cells, center, half_side, resolution)[0], 0)
-    is_full[tuple(cells[inside].T)] = True
+    is_inside, _ = _classify(silhouettes, _centers(cells, center, half_side, resolution)[0], 0)
+    is_full[tuple(cells[is_inside].T)] = True
     points, side = _centers(
         np.argwhere(is_full & ~scipy.ndimage.binary_erosion(is_full, border_value=1)), center, half_side, resolution
     )

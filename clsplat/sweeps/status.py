@@ -48,18 +48,18 @@ def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, A
         spec = read_json(folder.path / SPEC)
     spec = spec if isinstance(spec, dict) and isinstance(spec.get("pipeline"), dict) else {"pipeline": {}}  # damaged
     pipeline = spec["pipeline"]
-    common = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
-    common |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
+    fields = {"key": folder.key, "sweep": names[0], "name": names[1], "bits": spec.get("bits")}
+    fields |= {"pipeline": pipeline.get("name"), "seed": pipeline.get("seed"), "steps": _steps(pipeline)}
     if manifest := folder.manifest():
         result = {key: manifest.get(key) for key in ("device", "host", "worker")}
         result["seconds"] = finite_number(manifest.get("seconds"))
-        return {**common, "state": "published", **result, **_result_metrics(folder)}
+        return {**fields, "state": "published", **result, **_result_metrics(folder)}
     attempts = sorted(folder.attempts(), key=lambda attempt: attempt.last_beat)
     live_attempts = [item for item in attempts if item.exit_code is None and now - item.last_beat < NO_BEAT_S]
     if (failure := folder.failure()) and not live_attempts:
-        return {**common, "state": "failed", "message": failure.get("message"), "exit_code": failure.get("exit_code")}
+        return {**fields, "state": "failed", "message": failure.get("message"), "exit_code": failure.get("exit_code")}
     latest = (live_attempts or attempts)[-1:]
-    return {**common, "attempts": len(attempts), **(_attempt_state(latest[0], now) if latest else {"state": "waiting"})}
+    return {**fields, "attempts": len(attempts), **(_attempt_state(latest[0], now) if latest else {"state": "waiting"})}
 
 
 def _steps(pipeline: dict[str, Any]) -> int | None:

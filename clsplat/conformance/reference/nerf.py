@@ -79,9 +79,9 @@ class Composite:
 
     def weights(self) -> tuple[Floats, Floats]:
         """Return the weights of the samples, and the transmittance behind each, [R, N]."""
-        behind = np.exp(-np.cumsum(self.samples[1] * self.lengths, axis=1))
-        in_front = np.concatenate([np.ones_like(behind[:, :1]), behind[:, :-1]], axis=1)
-        return in_front - behind, behind
+        transmittance = np.exp(-np.cumsum(self.samples[1] * self.lengths, axis=1))
+        in_front = np.concatenate([np.ones_like(transmittance[:, :1]), transmittance[:, :-1]], axis=1)
+        return in_front - transmittance, transmittance
 
     def colors(self) -> Floats:
         """Return the colors of the rays, [R, 3]."""
@@ -94,9 +94,9 @@ class Composite:
         sigmoid = (colors + COLOR_PADDING) / (1 + 2 * COLOR_PADDING)
         grad_raw = grad_colors[:, None] * weights[..., None] * (1 + 2 * COLOR_PADDING) * sigmoid * (1 - sigmoid)
         grad_weights = (grad_colors[:, None] * (colors - self.background)).sum(axis=-1)
-        behind = np.cumsum((weights * grad_weights)[:, ::-1], axis=1)[:, ::-1] - weights * grad_weights
+        suffix_sums = np.cumsum((weights * grad_weights)[:, ::-1], axis=1)[:, ::-1] - weights * grad_weights
         slope = 1 / (1 + np.exp(-self.raw_densities - DENSITY_BIAS))
-        return grad_raw, (transmittance * grad_weights - behind) * self.lengths * slope
+        return grad_raw, (transmittance * grad_weights - suffix_sums) * self.lengths * slope
 
 
 # Cones of pixels, their samples, and the encodings of the samples.
@@ -238,6 +238,6 @@ class HashLevel:
 
     def _masked_corners(self, positions: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
         """Return the entries of the corners around samples, and their weights, 0 outside of the cube, both [S, 8]."""
-        inside = np.all((positions >= 0) & (positions <= 1), axis=1)
-        entries, weights = self.corners(np.where(inside[..., None], positions, 0.5))
-        return entries, weights * (inside * self.weights(variances))[:, None]
+        is_inside = np.all((positions >= 0) & (positions <= 1), axis=1)
+        entries, weights = self.corners(np.where(is_inside[..., None], positions, 0.5))
+        return entries, weights * (is_inside * self.weights(variances))[:, None]

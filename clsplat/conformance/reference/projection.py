@@ -423,5 +423,5 @@ def focal_gradient(
     z = foot.point[2]
     ray = foot.point[axis] / z
     low, high = ray_limits(camera)[axis]
-    inside = low <= ray <= high
-    return float(grad_mean2d[axis] * ray + grad_j[axis, axis] / z - (ray / z * grad_j[axis, 2] if inside else 0.0))
+    is_inside = low <= ray <= high
+    return float(grad_mean2d[axis] * ray + grad_j[axis, axis] / z - (ray / z * grad_j[axis, 2] if is_inside else 0.0))

@@ -215,11 +215,12 @@ class CameraState(ModuleState):
         if not (download := step.saved_value(self)) or step.view is None:
             return
         sums, name, (rotations, translations) = download(), self.views[step.view].name, self.pose_tables
-        change, (rotation, translation, focal) = self.pose_change(name), [at_step(r, step.number) for r in self.rates]
+        change = self.pose_change(name)
+        rotation_rate, translation_rate, zoom_rate = (at_step(r, step.number) for r in self.rates)
         grad_rotation, grad_translation = change.gradients(self.pose(step.view), sums[:3], sums[3:6])
-        rotations.update(self.scalars, name, grad_rotation, rotation)
-        translations.update(self.scalars, name, grad_translation, change.depth * translation)
-        self.zoom(name, float(sums[6]), focal)
+        rotations.update(self.scalars, name, grad_rotation, rotation_rate)
+        translations.update(self.scalars, name, grad_translation, change.depth * translation_rate)
+        self.zoom(name, float(sums[6]), zoom_rate)
 
     def zoom(self, view: str, grad_log: float, rate: float) -> None:
         """Update the focal lengths of a view's camera with Adam.  grad_log: gradient of the logarithm of the factor."""

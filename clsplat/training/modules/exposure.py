@@ -361,8 +361,8 @@ class ExposureState(ColorState):
             view: {**dict(zip(model.columns, map(float, row), strict=True)), "matrix": matrices[view].tolist()}
             for view, row in rows.items()
         }
-        meaning = f"{MEANING}; matrix: the rows of [E | b]"
-        facts = {"meaning": meaning, "type": self.settings.type, "model": model.type, "photographs": photographs}
+        description = f"{MEANING}; matrix: the rows of [E | b]"
+        facts = {"meaning": description, "type": self.settings.type, "model": model.type, "photographs": photographs}
         return ColorReport(matrices, facts)
 
 

@@ -105,8 +105,8 @@ class Rig:
         c = view.camera
         with np.errstate(all="ignore"):
             u, v = c.fx * x / z + c.cx, c.fy * y / z + c.cy
-        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < c.width) & (v < c.height)
-        return np.asarray(z[inside])
+        is_inside = (z > 0) & (u >= 0) & (v >= 0) & (u < c.width) & (v < c.height)
+        return np.asarray(z[is_inside])
 
     @cached_property
     def camera(self) -> Camera:
