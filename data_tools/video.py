@@ -28,7 +28,7 @@ STILL = 0.1  # px per frame: smaller motion is noise or compression artifacts
 
 
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None, times: bool = False) -> int:
-    """Split a video into `frames` parts of equal motion and write the sharpest frame of each; return their number.
+    """Split a video into `frames` parts of equal motion and write the sharpest frame of each.  Return their number.
 
     long_side: the maximum width and height of the images, px
     times: also write times.json, the index of each frame in the video, for a dynamic scene

@@ -130,8 +130,8 @@ class Trainer:
     def close(self) -> None:
         """End the training and unlock the run folder.  The training can be resumed from `out`.
 
-        Before the last step, the state in status.json becomes "interrupted".  After the last step, or after an error, a
-        trainer closes automatically.
+        Before the last step, the state in status.json becomes "interrupted".  A trainer closes automatically after the
+        last step or an error.
         """
         if self._state == "open":
             self._state = "closed"

@@ -51,10 +51,10 @@ class CheckResult:
 def run_checks(
     info: DeviceInfo, schedule: str, checks: Sequence[Check], seconds: float = TIMEOUT_S
 ) -> Iterator[CheckResult]:
-    """Run checks on a device with a schedule; yield each result when it is complete.
+    """Run checks on a device with a schedule, and yield each result when it is complete.
 
     A check without output for `seconds` is stopped.  A check that cannot be completed is repeated with empty caches of
-    built kernels; after the first repetition that fails too, no more checks are repeated.
+    built kernels.  After the first repetition that also fails, no more checks are repeated.
     """
     remaining, retry = list(checks), True
     while remaining:

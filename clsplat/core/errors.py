@@ -80,7 +80,7 @@ class NumericError(ClsplatError):
 
 
 class NotFiniteError(NumericError):
-    """The training state is not finite; it was saved separately as failed_N.npz."""
+    """The training state is not finite.  It was saved separately as failed_N.npz."""
 
 
 class EmptyRegionError(NumericError):

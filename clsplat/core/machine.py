@@ -56,12 +56,12 @@ def cache_folder() -> Path:
 
 
 def user_cache_folders() -> list[Path]:
-    """Return the folder in POCL_CACHE_DIR, which PoCL uses instead of its default; an empty list if it is not set."""
+    """Return a list with the folder in POCL_CACHE_DIR, which PoCL uses instead of its default; empty if not set."""
     return [Path(os.environ["POCL_CACHE_DIR"])] if os.environ.get("POCL_CACHE_DIR") else []
 
 
 def _write_fault(folder: Path) -> str:
-    """Create a folder and try to write in it; return why that fails, or ''."""
+    """Create a folder and try to write in it; return the reason for a failure, or ''."""
     if not folder.is_absolute():  # if HOME is relative
         return f"{folder}: is not an absolute path"
     try:
@@ -223,7 +223,7 @@ def _boot_id() -> str | None:
 def is_alive(process: int) -> bool:
     """Return whether a process of this machine is running; True if unknown.
 
-    A process ID may have been reused by another process.
+    The ID may belong to another, newer process.
     """
     if sys.platform == "win32":  # os.kill(process, 0) would kill it there
         return _is_alive_on_windows(ctypes.WinDLL("kernel32", use_last_error=True), process)

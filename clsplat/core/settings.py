@@ -1,7 +1,7 @@
 """Define settings: frozen models whose fields are the keys of a pipeline file, and the named variants of a key.
 
 A variant is a subclass with a name, the literal of its field `type`, or `stage` for stages.  A pipeline file can
-use it as soon as its class is defined, in the package or in a plug-in; there is no other list of variants.
+use it as soon as its class is defined, in the package or in a plug-in.  There is no other list of variants.
 """
 
 import ast
@@ -154,7 +154,7 @@ def _variants_by_name(base: type[Base], subclasses: tuple[type["Settings"], ...]
 
 
 def invalid_variant_reason(kind: type[Settings]) -> str | None:
-    """Return why a class that resembles a variant cannot be used in a pipeline file, or None."""
+    """Return the reason why a class that resembles a variant cannot be used in a pipeline file, or None."""
     if kind.__subclasses__():
         return None
     if missing := sorted(getattr(kind, "__abstractmethods__", ())):

@@ -229,7 +229,7 @@ def _create_bar() -> Progress:
 
 @contextmanager
 def _draw(bar: "Progress | _RunBar") -> Iterator[None]:
-    """Draw a bar several times a second during the block; log lines appear above it."""
+    """Draw a progress bar several times a second during the block.  Log lines appear above the bar."""
     with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, counts_as_debug():
         _bars.append(live)
         try:

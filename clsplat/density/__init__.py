@@ -1,4 +1,4 @@
-"""Density control: statistics of Gaussians, edits, budgets, and the scores that several rules share."""
+"""Density control: statistics of Gaussians, edits, budgets, and scores shared by several rules."""
 
 from clsplat.core.settings import import_modules
 

@@ -59,8 +59,8 @@ MIN_BOUND = 1.2e-38  # the smallest normal float, a lower bound of all positive 
 class Edit:
     """An edit of the Gaussians: the outcome of each.
 
-    An outcome consists of the number of rows that the Gaussian becomes, how many of them are its old row, the factor on
-    the scales of fresh rows, and whether the rows share its opacity.
+    An outcome consists of the number of rows that replace the Gaussian, the number of these that are its old row, the
+    factor on the scales of fresh rows, and whether the rows share its opacity.
 
     Random numbers depend only on `seed`, `step`, and the rule.
     """
@@ -212,7 +212,7 @@ class Edit:
         return None if self.max_rows is None else self.max_rows - int(self.rows().sum(dtype=np.int64))
 
     def undo_growth(self, mask: NDArray[np.bool_]) -> None:
-        """Undo the growth of the Gaussians of a mask, [N]; the edit then leaves them unchanged."""
+        """Undo the growth of the Gaussians in a mask, [N], so that the edit does not change them."""
         mask = mask & (self.rows() > 1)
         for array, unchanged_value in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
             array.set(np.where(mask, unchanged_value, array.get()))

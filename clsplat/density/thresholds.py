@@ -40,7 +40,7 @@ def _raise_no_photographs(q: float) -> float:
 
 @dataclass(frozen=True)
 class SceneScale:
-    """The scene's values that thresholds of rules are relative to."""
+    """The properties of the scene to which thresholds of rules are relative."""
 
     extent: float  # scene units
     texture_quantile: Callable[[float], float] = _raise_no_photographs  # quantile -> texture of the photographs, per px

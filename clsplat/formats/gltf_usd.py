@@ -167,7 +167,7 @@ class Gltf:
         return parameters
 
     def accessor(self, number: Any, width: int) -> NDArray[np.float32]:
-        """Return the rows of an accessor, [count, width]; normalized integers are scaled to [-1, 1]."""
+        """Return the rows of an accessor, [count, width].  Normalized integers are scaled to [-1, 1]."""
         row = self.tree["accessors"][_index(number)]
         kind, count, start = COMPONENTS[row["componentType"]], _index(row["count"]), _index(row.get("byteOffset", 0))
         if WIDTHS.get(row["type"]) != width or "sparse" in row or "bufferView" not in row:

@@ -225,7 +225,7 @@ _COLUMNS = {
 
 
 def read_ply(path: Path) -> SplatFile:
-    """Read a splat PLY; the discs of 2DGS, which have no scale_2, get a third log scale of at most FLAT_LOG_SCALE.
+    """Read a splat PLY.  The discs of 2DGS, which have no scale_2, get a third log scale of at most FLAT_LOG_SCALE.
 
     Raises DataError if it is missing, damaged, or not a splat.
     """

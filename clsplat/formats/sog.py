@@ -462,7 +462,7 @@ def _training_entries(count: int, quality: Quality) -> int:
 
 
 def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
-    """Round the tables, and return them with a palette of the SH; None without SH bands above 0.
+    """Round the tables, and return them with a palette of the SH, which is None without SH bands above 0.
 
     If the SH already form a palette, training has rounded all tables, and they stay unchanged.
     Quality `high` rounds tables only to the precision of the format.

@@ -80,7 +80,7 @@ def model_file(path: Path) -> Path:
 
 
 def model_files(path: Path) -> list[Path]:
-    """Return a model's main file and the files that it names."""
+    """Return a model's main file and the files that it refers to."""
     if path.name == LOD_META:
         return lod_files(path)
     files = {".json": sog_folder_files, ".gltf": gltf_files}.get(path.suffix.lower())

@@ -328,7 +328,7 @@ def _restore_on_failure(files: Sequence[Path]) -> Iterator[None]:
 
 
 def _link_or_copy(file: Path, target: Path) -> None:
-    """Link a file, or copy it on a file system without links; files are replaced and never changed in place."""
+    """Link a file, or copy it on a file system without links.  Files are replaced and never changed in place."""
     try:
         os.link(file, target)
     except OSError:
@@ -336,7 +336,7 @@ def _link_or_copy(file: Path, target: Path) -> None:
 
 
 def _require_no_other_frames(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
-    """Raise ConfigError if a folder has frames of another series, since players would show them too.
+    """Raise ConfigError if a folder has frames of another series, because players would also show those.
 
     names: the pattern of the frames' names.
     """
@@ -371,7 +371,7 @@ LOGIT = 6.0  # of the opacity of sky Gaussians
 
 
 def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floating] | None = None) -> Model:
-    """Replace the sky of a model by Gaussians; a model without a sky is returned unchanged.
+    """Replace the sky of a model with Gaussians.  A model without a sky is returned unchanged.
 
     center: the center of the sphere, [3], from which the sky looks exact; by default, the median of the means.
     """

@@ -1,8 +1,8 @@
 """Offload the SH bands above 0 and their moments to host memory.
 
 They take 540 of the 708 bytes of a Gaussian of SH degree 3 with its moments.  The device stores the blocks of LANES
-rows that a view sees in slots (cl_kernels/slots.h), in row order.  They are uploaded before the view is rendered, and
-downloaded before the next one.
+rows that are visible in a view in slots (cl_kernels/slots.h), in row order.  They are uploaded before the view is
+rendered, and downloaded before the next view.
 """
 
 from collections.abc import Callable, Iterator

@@ -57,7 +57,7 @@ class Haar(TrainingModule):
                 )
 
     def penalty(self, scalars: Scalars, step: int) -> tuple[float, ByNumber]:
-        """Return the loss that pulls the filter to Haar's, and its derivatives."""
+        """Return the loss that pulls the filter toward the Haar filter, and its derivatives."""
         weight = at_step(self.weight, step)
         offsets = {name: value - (name == "haar/scale") for name, value in scalars.items()}
         value = weight * 2 * sum(offset**2 for offset in offsets.values())

@@ -53,7 +53,7 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
 
 
 class ByScore(Rule):
-    """Base class of rules that sample Gaussians by score; rules with the same `views` share the score."""
+    """Base class of rules that sample Gaussians by score.  Rules with the same `views` share the scores."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"views"})
 

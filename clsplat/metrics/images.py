@@ -12,7 +12,7 @@ Mask = NDArray[np.bool_]
 
 
 def to_8_bits(image: NDArray[np.generic]) -> Image:
-    """Convert an image with values in [0, 1] to 8 bits: clamp and round to nearest; uint8 is returned unchanged.
+    """Convert an image with values in [0, 1] to 8 bits: clamp and round to nearest.  uint8 is returned unchanged.
 
     Raises ValueError for other types, such as 16-bit integers.
     """

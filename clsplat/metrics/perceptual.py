@@ -30,7 +30,7 @@ class Lpips:
 
     The ONNX file is the output of `clsplat data lpips`, or of `torch.onnx.export` for `lpips.LPIPS(net="vgg")` with
     dynamic height and width.  It has two inputs, `in0` and `in1`, RGB of [1, 3, height, width], and a scalar output.
-    This network expects values in [-1, 1]; 3DGS and Mip-Splatting report its results for values in [0, 1].
+    The network expects values in [-1, 1]; 3DGS and Mip-Splatting report its results for values in [0, 1].
     """
 
     def __init__(self, path: Path, inputs: InputRange) -> None:
@@ -199,7 +199,7 @@ def ssim_map(image: Image, photograph: Image) -> Floats:
 
 
 def _ssim_factors(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the luminance and contrast-structure factors of pixels whose window is inside (Wang et al. 2004)."""
+    """Return the luminance and contrast-structure factors of pixels with a complete window (Wang et al. 2004)."""
     mx, my = _window_mean(x), _window_mean(y)
     variances = _window_mean(x * x) - mx * mx + _window_mean(y * y) - my * my
     covariance = _window_mean(x * y) - mx * my

@@ -62,7 +62,7 @@ class CameraSums:
 
 
 class FlickerMeter:
-    """Measures flicker from sums over the views of each camera; ignores moving cameras and single timestamps."""
+    """Measures flicker from sums over the views of each camera.  Moving cameras and single timestamps are ignored."""
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: all views that will be added, in any order."""

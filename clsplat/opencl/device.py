@@ -388,8 +388,8 @@ def group_limit(kernel: Any, device: Any) -> int:
 def underreports_group_limit(info: DeviceInfo, limit: int, multiple: int) -> bool:
     """Return whether a runtime reports a group size limit that is too small, as rusticl does.
 
-    It reports `multiple`, the number of items that run together, but runs larger groups: Mesa 22.3.6 reports 32 for a
-    kernel that requires 256.
+    It reports `multiple`, the number of work-items that run together, but can run larger groups.  Mesa 22.3.6 reports
+    32 for a kernel that requires 256.
     https://gitlab.freedesktop.org/mesa/mesa/-/blob/mesa-22.3.6/src/gallium/frontends/rusticl/api/kernel.rs
     """
     return info.platform.startswith("rusticl") and limit == multiple

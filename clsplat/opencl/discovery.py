@@ -144,9 +144,9 @@ def choose(device_name: str | None = None) -> DeviceInfo:
 
 
 def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
-    """Return the sort key: GPUs first, discrete before integrated ones, by units times clock; then CPUs, then others.
+    """Return the sort key: GPUs first, discrete before integrated, by units times clock; then CPUs, then others.
 
-    The number of units does not suffice, because some vendors count entire processors, and others their parts.
+    The number of units is not enough, because some vendors count entire processors, and others their parts.
     """
     gpu = info.kind == "GPU"
     return ("GPU", "CPU", "other").index(info.kind), gpu and info.unified, -info.units * info.clock if gpu else 0

@@ -150,7 +150,7 @@ class Execution(LocalExecution):
 
     @property
     def address(self) -> str:
-        """The scheduler's address, as Dask writes it."""
+        """The scheduler's address in the notation of Dask."""
         return self.engine.replace("dask://", "tcp://")
 
     def store_folder(self, out: Path) -> Path:

@@ -117,7 +117,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def _items(stages: Mapping[str, type[Settings]], required: Sequence[str] = ()) -> dict[str, Any]:
-    """Return the schema of the stages in a list; every stage also needs the `required` keys."""
+    """Return the schema of the stages in a list.  Every stage also needs the `required` keys."""
     names = sorted(name for name, kind in stages.items() if not required and not needs_settings(kind))
     with_settings = [
         {

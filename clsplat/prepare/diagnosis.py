@@ -92,7 +92,7 @@ def diagnose(graph: MatchGraph) -> str:
 
 
 def _describe_groups(graph: MatchGraph, groups: Sequence[list[str]]) -> str:
-    """Describe which photographs match each other, and which match no other."""
+    """Describe which photographs match each other, and which do not match any other photograph."""
     single_names = [name for group in groups if len(group) == 1 for name in group]
     count = len(groups) - len(single_names)
     if not count:

@@ -156,7 +156,7 @@ def failure_reason(photograph: Path, error: DataError) -> str:
 
 
 def remedy_for(read_errors: Mapping[str, str]) -> str:
-    """Return a remedy for photographs that cannot be read.  read_errors: reasons by name, as `gather` returns them."""
+    """Return a remedy for photographs that cannot be read.  read_errors: reasons by name, from `gather`."""
     remedies = {f"the file is {content}": remedy for _, content, remedy in STARTS}
     for kind in BRANDS:
         remedies[OTHER_FORMAT.format(kind)] = f"convert {kind} files to JPEG, for example with {CONVERTERS[kind][1]}"

@@ -40,7 +40,7 @@ class Step(Settings):
         """
 
     def is_done_in(self, source: Path) -> bool:
-        """Return whether `source`, such as a scene with cameras, needs neither this step nor the later ones."""
+        """Return whether `source`, such as a scene with cameras, needs neither this step nor any later step."""
         return False
 
     def pieces(self, photographs: int) -> tuple[int, str]:
@@ -132,8 +132,8 @@ class MatchFeatures(Step):
 class MapCameras(Step):
     """Find cameras and points from matches.
 
-    When photographs cannot be placed, it tries again with looser settings, with more pairs unless `match_features`
-    matched all of them, and with more features.
+    If photographs cannot be placed, the step tries again with looser settings, with more pairs unless
+    `match_features` matched all of them, and with more features.
     """
 
     version: ClassVar[int] = 2  # matches more pairs of unplaced photographs

@@ -57,7 +57,7 @@ class Painter(Protocol):
 
     @property
     def workspace(self) -> Workspace:
-        """Device memory that is reused between renders."""
+        """The device memory that is reused between renders."""
 
     def paint(self, camera: DeviceCamera) -> Array:
         """Return the render, [3, rows, stride], not clamped; valid until the next render."""

@@ -271,7 +271,7 @@ class Rasterizer:
         return Frame(camera, *buffers, image, transmittance, bands, content, model)
 
     def _blend(self, content: Content, **defines: int) -> Program:
-        """Return the blending kernels, with a fourth plane only if the content needs it."""
+        """Return the blending kernels, which have a fourth plane only if the content needs it."""
         defines |= {"INVERSE_DEPTH": 1} if content == "inverse_depth" else {}
         return self.device.program(f"blend_{self.device.schedule}.cl", **defines)
 

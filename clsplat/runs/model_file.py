@@ -199,8 +199,8 @@ def find_run(model: Path) -> Path | None:
 def photo_folder(scene: Path) -> Path:
     """Return the dataset folder of a scene.
 
-    scene: the dataset folder itself, or a run folder, whose pipeline names the dataset folder.  Raises ConfigError if
-    that pipeline cannot be read or names no folder, and DataError if the named folder is missing.
+    scene: the dataset folder, or a run folder whose pipeline contains the path of the dataset.  Raises ConfigError if
+    that pipeline cannot be read or has no path, and DataError if the dataset folder is missing.
     """
     if not has_pipeline(scene):
         return scene

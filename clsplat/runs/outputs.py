@@ -133,7 +133,7 @@ def _is_in_photo_folder(out: Path, scene: Path) -> bool:
 def check_names(state: RunState, names: Collection[str], outputs: Sequence[Path] = ()) -> None:
     """Raise ConfigError if a file to write is outside of the run folder, or exists and is not from a run.
 
-    names: file names in the folder of the run or matrix.  outputs: further files or folders to write.
+    names: file names in the folder of the run or matrix.  outputs: other files or folders to write.
     """
     out, files = state.out, [*(state.out / name for name in sorted(names)), *outputs]
     require_inside(out, files)

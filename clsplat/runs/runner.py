@@ -117,7 +117,7 @@ def _read_identity(path: Path) -> Identity | None:
 def finishing_on_interrupt(run: Run) -> Iterator[None]:
     """At the first signal, finish the current step, or the current view of a longer stage, and save the state.
 
-    The second signal stops at once.  So does the first if there is no model to save.
+    The second signal stops the run immediately, as does the first if there is no model to save.
     """
 
     def finish() -> None:

@@ -141,7 +141,7 @@ def _difference(old_pipeline: Pipeline, new_pipeline: Pipeline) -> Difference | 
 
 
 def is_below(file: Path, paths: Iterable[Path]) -> bool:
-    """Return whether a file is one of the paths, or is inside one of them."""
+    """Return whether a file is one of the paths or inside one of them."""
     return any(map(file.is_relative_to, paths))
 
 

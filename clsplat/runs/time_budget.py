@@ -142,8 +142,8 @@ def _execute_until(
 def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, deadline: float) -> Rehearsal:
     """Repeat the rehearsal with more steps until it takes a minimum fraction of the budget; return the last one.
 
-    The result includes the trend of step times.  deadline: on the clock of `time.perf_counter`, s.  Raises ConfigError
-    as `rehearse` does.
+    The result includes the trend of step times.  deadline: on the clock of `time.perf_counter`, s.  Raises the errors
+    of `rehearse`.
     """
     steps, start_time, trend = min(STEPS, pipeline.settings.training.rehearsal_steps), time.perf_counter(), 0.0
     rehearsal = rehearse(pipeline, run, steps, minutes, deadline)

@@ -124,7 +124,7 @@ def _read(model: Path) -> AnyModel:
 def _scene(
     model: Path, scene: Path | None, host_model: AnyModel, downscale: float | None, is_required: bool
 ) -> Scene | None:
-    """Return the scene of a model at the image size of its run; None if the scene is unknown and not required."""
+    """Return the scene of a model at the image size of its run, or None if the scene is unknown and not required."""
     if not is_required and scene is None and not has_pipeline(model):
         return None
     try:

@@ -226,7 +226,7 @@ class Lens:
 
     @cached_property
     def is_wide(self) -> bool:
-        """Whether the field of view is too wide for one pinhole image, so that the photograph is cut into faces."""
+        """Whether the field of view is too wide for one pinhole image, so that the photograph is split into faces."""
         is_panorama = self.model == "EQUIRECTANGULAR"
         return is_panorama or (self.model in WIDE and bool(self._angles[0].max() > MIN_WIDE))
 

@@ -21,7 +21,7 @@ PRECEDENCE = (MulticameraReader, ColmapReader, BlenderReader, MultiscaleReader, 
 
 
 def readers() -> list[Reader]:
-    """Return the readers in order of precedence: shipped ones, then those of plug-ins in order of definition.
+    """Return the readers in order of precedence: shipped readers, then readers of plug-ins in order of definition.
 
     Raises ConfigError if two readers have the same name.
     """

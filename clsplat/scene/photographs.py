@@ -64,8 +64,8 @@ def find_masks(folder: Path, names: Sequence[str]) -> list[Path | None]:
 def with_masks(scene: Scene, folder: Path | None) -> Scene:
     """Return the scene with the masks in `folder`, or the scene itself if `folder` is None.
 
-    All pixels of a photograph without a mask are used.  Faces of a wide photograph that its mask hides are left out.
-    Raises DataError if the folder does not exist or contains no mask of any photograph, or if the dataset already has
+    All pixels of a photograph without a mask are used.  Faces of a wide photograph that its mask hides are omitted.
+    Raises DataError if the folder does not exist or contains no mask for any photograph, or if the dataset already has
     masks.
     """
     if folder is None:

@@ -46,10 +46,10 @@ def measure_scene(scene: Scene, measure_sky: Callable[[], float | None] = lambda
 
 
 def near_depth(scene: Scene) -> float | None:
-    """Return the 1 % quantile of the depths of all points that training views observe, scene units.
+    """Return the 1 % quantile of the depths of all points that training views observe, in scene units.
 
-    Validation views count as training views.  When the dataset does not contain observations, a view observes all
-    points inside its image.  None if no view observes a point.
+    Validation views count as training views.  If the dataset does not contain observations, a view observes all
+    points inside its image.  Returns None if no view observes a point.
     """
     views = scene.merge_validation().split("train")
     with np.errstate(all="ignore"):  # points of a damaged file

@@ -59,7 +59,7 @@ class JsonFrame:
             return np.empty(0)
 
     def number(self, key: str) -> float | None:
-        """Return a number of magnitude below MAX_VALUE, or None without a value.  Raises DataError otherwise."""
+        """Return a number of magnitude below MAX_VALUE, or None if it is missing.  Raises DataError otherwise."""
         value = self.value(key)
         if value is None:
             return None

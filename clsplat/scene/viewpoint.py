@@ -54,9 +54,9 @@ class Viewpoint:
 def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     """Return the up direction as a unit vector, [3].
 
-    If the cameras turn and are level, it is perpendicular to their right axes.  Otherwise it is the mean of their up
-    axes, which is tilted if all cameras look down from one side.  If the up axes cancel out, it is opposite to the mean
-    viewing direction.
+    If the cameras are level and have different directions, it is perpendicular to their right axes.  Otherwise it is
+    the mean of their up axes, which is tilted if all cameras look down from one side.  If the up axes cancel out, it is
+    opposite to the mean viewing direction.
     """
     poses = np.stack([view.world_to_camera for view in views]).astype(np.float64)
     right, up, forward = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)

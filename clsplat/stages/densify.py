@@ -56,7 +56,7 @@ class Densify(Scheduled):
 
     @property
     def statistics(self) -> set[str]:
-        """Columns of statistics that the rules read."""
+        """The columns of statistics that the rules read."""
         return {name for source in (*self.rules, self.budget) if source for name in source.statistics}
 
     @property

@@ -172,7 +172,7 @@ class ValidatedTraining(Training):
         return is_out_of_patience or run.stage_step >= self.steps
 
     def finish(self, run: Run) -> None:
-        """Replace the last model by the best one at the end of the training."""
+        """Replace the last model with the best model at the end of training."""
         best = run.best
         if self.keep == "last" or best is None or best.ended is not None:
             return
@@ -305,7 +305,7 @@ class Optimize(ValidatedTraining):
             stage.finish(run)
 
     def iterate(self, run: Run) -> Iterator[ViewGradients]:
-        """Train step by step; yield the losses and gradients of each step, valid until the next step."""
+        """Train step by step.  Yield the losses and gradients of each step, which are valid until the next step."""
         self.reset_best(run)
         views = self.views.resolve(run.training_images)
         last_step = run.step - run.stage_step + self.steps

@@ -1,4 +1,4 @@
-"""Quantize harmonics and tables as SOG stores them: build a palette, train it, round tables."""
+"""Quantize harmonics and tables for SOG: build a palette, train it, and round tables."""
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping

@@ -72,7 +72,7 @@ class Snapshot(Scheduled):
 
 
 class Timelapse(Stage):
-    """Make a video of the renders that the stage `snapshot` wrote during training."""
+    """Write a video of the renders that the stage `snapshot` wrote during training."""
 
     stage: Literal["timelapse"] = "timelapse"
     needs: ClassVar[frozenset[str]] = frozenset({"painter", "snapshots"})

@@ -526,7 +526,7 @@ class Store:
         return folder
 
     def cancel(self, cell: str | None = None) -> str:
-        """Request that all running cells stop, or only one of them; return "all" or the key of the cell.
+        """Request that all running cells stop, or only one cell.  Return "all" or the key of the cell.
 
         cell: its name or key.  Raises ConfigError if there is no such cell.
         """

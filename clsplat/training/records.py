@@ -191,7 +191,7 @@ MIN_COST = 0.4  # likewise; fits are unreliable on a busy machine
 
 
 def moving_average(psnrs: Sequence[float]) -> list[float]:
-    """Return the moving average of PSNR over VIEWS reports; a report covers one view, and views differ by many dB."""
+    """Return the moving average of PSNR over VIEWS reports.  Each report covers one view, and views differ a lot."""
     return [fmean(psnrs[max(0, end - VIEWS) : end]) for end in range(1, len(psnrs) + 1)]
 
 

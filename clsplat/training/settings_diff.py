@@ -69,7 +69,7 @@ def _kinds(items: list[Any]) -> dict[str, Any]:
 
 
 def first_difference(old: Any, new: Any) -> Difference | None:
-    """Return the first difference of two resolved pipelines, or None."""
+    """Return the first difference between two resolved pipelines, or None."""
     return next(differences(old, new), None)
 
 

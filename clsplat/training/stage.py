@@ -118,7 +118,7 @@ class Scheduled(Stage):
         """Add the tables that the stage needs, before the first step; a resumed run already has them."""
 
     def finish(self, run: Run) -> None:
-        """Finish after the last step of training; a resumed run may call this again."""
+        """Finish after the last step of training.  A resumed run may call this again."""
 
     def is_due(self, step: int, is_last: bool = False) -> bool:
         """Return whether the stage runs at a global step.  is_last: whether it is the last step of training."""
@@ -127,7 +127,7 @@ class Scheduled(Stage):
         return step > self.start and (self.stop is None or step < self.stop)
 
     def is_overdue(self, run: Run) -> bool:
-        """Return whether the stage runs now in addition to its cadence; only for stages that change no results."""
+        """Return whether the stage must run now in addition to its cadence; only for stages that do not change results."""
         return False
 
     def stale(self, run: Run) -> Collection[str]:
@@ -136,7 +136,7 @@ class Scheduled(Stage):
 
 
 def find_output_conflict(stages: Sequence[Stage]) -> str | None:
-    """Return a path that two stages would write, at least one of them as a file; None without such a path.
+    """Return a path that two stages would write, at least one of them as a file, or None.
 
     Stages may share a folder.  Names are compared without case, since some file systems ignore it.
     """
@@ -212,7 +212,7 @@ class Training(Stage):
         return list(during)
 
     def has_ended(self, run: Run) -> bool:
-        """Return whether all steps of the stage are done."""
+        """Return whether the stage has completed all its steps."""
         return run.stage_step >= self.steps
 
     def after_stage(self, run: Run, stage: Scheduled) -> None:

@@ -158,7 +158,7 @@ def _ticks(low: float, high: float, is_integer: bool = False) -> list[float]:
 
 
 def _decade_ticks(low: float, high: float) -> list[float]:
-    """Return logarithms of 1, 2, and 5 times powers of ten, or of round numbers if fewer than two of them fit."""
+    """Return the logarithms of 1, 2, and 5 times powers of ten, or of round numbers if fewer than two of these fit."""
     powers = range(math.floor(low), math.ceil(high) + 1)
     ticks = [t for p in powers for m in (1, 2, 5) if low <= (t := p + math.log10(m)) <= high]
     return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]

@@ -133,7 +133,7 @@ def _frame(means: Floats) -> tuple[Floats, float]:
 
 
 def _logarithmic(means: NDArray[np.floating], origin: Floats, unit: float) -> Floats:
-    """Return the logarithmic coordinates t, [N, 3]."""
+    """Return the logarithmic coordinates t of positions, [N, 3]."""
     offsets = (means.astype(np.float64) - origin) / unit
     return np.asarray(np.sign(offsets) * np.log1p(np.abs(offsets)))
 

@@ -75,7 +75,7 @@ def block_pipeline(
 
 
 def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
-    """Return a pipeline that starts from the merged model and runs the stages after training, or only exports it."""
+    """Return a pipeline that starts from the merged model and runs the stages after training, or only an export."""
     data, stage_count = pipeline.resolved(), _count_until_last_edit(pipeline)
     stages = [*_with_start(data["stages"][:1], file), *(data["stages"][stage_count:] or [{"export": {"file": MODEL}}])]
     return check_document(pipeline.path, Document({**data, "stages": stages}))

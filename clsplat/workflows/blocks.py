@@ -334,9 +334,9 @@ def _format_mib(size: int) -> str:
 def plan_blocks(
     scene: Path, blocks: int, pipeline: str = "blocks", device: str | Device | None = None
 ) -> dict[str, Any]:
-    """Partition the scene's points, and return the manifest with estimated times; nothing is written.
+    """Partition the scene's points, and return the manifest with estimated times.  Nothing is written.
 
-    Raises ConfigError for an invalid number of blocks, and DataError if the scene has no or too few points.
+    Raises ConfigError for an invalid number of blocks, and DataError if the scene has too few points.
     """
     settings = load(pipeline, [f"scene.path={path_setting(photo_folder(scene))}", "init.file=points"]).settings
     with log_level(logging.ERROR):  # `Blocks` reads the scene again and logs its warnings

@@ -124,7 +124,7 @@ class CompressionTarget:
         return cls(text.strip(), max_bytes=int(value * UNITS[unit]))
 
     def is_met(self, point: Point, psnr: float) -> bool:
-        """Return whether a file meets the target; psnr: PSNR of the original model, dB."""
+        """Return whether a file meets the target.  psnr: PSNR of the original model, dB."""
         if self.max_bytes is not None:
             return point.bytes <= self.max_bytes
         return point.psnr >= psnr + (self.psnr_change or 0)
@@ -149,7 +149,7 @@ class CompressionTarget:
         return "allow a larger loss, or train longer with --steps"
 
     def is_decided(self, rung: Sequence[Point], psnr: float) -> bool:
-        """Return whether fewer Gaussians cannot help: every file of a rung fits, or none is good enough."""
+        """Return whether fewer Gaussians cannot help, because every file of a rung fits, or none is good enough."""
         results = [self.is_met(point, psnr) for point in rung]
         return all(results) if self.max_bytes is not None else not any(results)
 

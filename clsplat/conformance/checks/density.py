@@ -254,7 +254,7 @@ def _falloff_squares(case: Case, background: NDArray[Any], mask: Mask | None) ->
 
 @CHECKS.add("most_alike")
 def most_alike_labels(device: Device, rng: np.random.Generator) -> Results:
-    """Compare the labels of the most similar vectors.  Values are integers, so that all products are exact."""
+    """Compare the labels of the most similar vectors.  Values are integers, so all products are exact."""
     for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
         points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
         vectors[-1] = vectors[0]  # a tie, which the first wins

@@ -122,9 +122,9 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
 
 
 def _max_alpha(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the largest alpha of each record in each tile, and whether it decides if the pair is allowed, both [T, N].
+    """Return the largest alpha of each record in each tile, and whether it determines if the pair is allowed, [T, N].
 
-    It does not for tiles at the edge of the image and for splats thinner than a few pixels, whose pairs may be listed
+    For tiles at the edge of the image and for splats thinner than a few pixels, it does not: their pairs may be listed
     although they reach no pixel.
     """
     records, camera = frame.splats.get().astype(np.float64), frame.camera

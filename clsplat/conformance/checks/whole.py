@@ -48,7 +48,7 @@ def _render_photograph(device: Device, case: Case) -> Photograph:
 def train(
     device: Device, case: Case, start: dict[str, NDArray[Any]], steps: int
 ) -> tuple[list[float], dict[str, NDArray[Any]]]:
-    """Train Gaussians, from `start`, on a render of a scene, with one density edit; return the losses and tables."""
+    """Train Gaussians from `start` on a render of a scene, with one density edit.  Return the losses and tables."""
     photograph = _render_photograph(device, case)
     model = Case(start, case.view).model(device)
     gaussians, rasterizer = model.gaussians, Rasterizer(device, "radix")

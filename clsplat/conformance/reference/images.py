@@ -203,9 +203,9 @@ def residual_histogram(values: NDArray[Any]) -> NDArray[np.int64]:
 def mask_transients(
     values: NDArray[Any], counted: NDArray[np.bool_], threshold: float, reach: int
 ) -> NDArray[np.bool_]:
-    """Return a mask of the pixels that count, [H, W].
+    """Return a mask, [H, W], of the pixels that are not transient.
 
-    A residual is below the threshold, or at least half of the residuals in the box around it are.
+    Their residuals, or at least half of the residuals in the box around them, are below the threshold.
     """
     mask = counted & (values < threshold)
     is_below = mask.copy()

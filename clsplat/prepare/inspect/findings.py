@@ -338,7 +338,7 @@ MAX_CAMERAS = 4  # number of cameras to list
 
 
 def summarize(facts: Facts) -> dict[str, str]:
-    """Return the main facts as lines of text, by label."""
+    """Return the main facts as a dict from labels to lines of text."""
     fallback = "photos without cameras" if facts.unplaced else "none found"
     lines = {"dataset": facts.kind if facts.kind != "none" else fallback, "images": _image_counts(facts)}
     if capture := facts.capture:

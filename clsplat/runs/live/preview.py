@@ -195,13 +195,13 @@ class Credit:
             return self._update()
 
     def spend(self, amount: float) -> None:
-        """Subtract an amount of time, s, from the credit."""
+        """Subtract an amount of time in seconds from the credit."""
         with self._lock:
             self._credit = self._update() - amount
             self.spent += amount
 
     def skip(self) -> None:
-        """Add no credit for the time since the last update."""
+        """Restart the clock of the credit, so that the time since the last update is not added."""
         with self._lock:
             self._updated = self._clock()
 

@@ -92,7 +92,7 @@ def _train_seconds(row: VariantRow) -> float:
 
 
 def _cost(rows: Sequence[VariantRow], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
-    """Return a list with the column of a cost that only some runs record; empty if none of the runs recorded it."""
+    """Return the column of a cost that only some runs record, as a list; empty if no run recorded it."""
     optional_values = [[cost(run.metrics) for run in row.runs] for row in rows]
     values = [[value for value in row if value is not None] for row in optional_values]
     return [Column(heading, _cells(values, 0))] if any(values) else []

@@ -93,7 +93,7 @@ def _count_skies(run: Run, min_fraction: float) -> tuple[int, int]:
 
 
 def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
-    """Decide whether the model gets a sky, and return the decision and the reason for it."""
+    """Decide whether the model has a sky, and return the decision and its reason."""
     if reason := _explain_unknown(run):
         return "off", reason
     sky_count, count = _count_skies(run, background.share)

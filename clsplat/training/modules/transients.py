@@ -101,7 +101,7 @@ def measure_residuals(
 ) -> tuple[Array, Callable[[], NDArray[np.uint32]]]:
     """Return the residuals, [1, rows, stride], and a function that waits for their counts, [BINS], and returns them.
 
-    image, photograph: planes, [3, rows, stride]; mask: [1, rows, stride], 1 in pixels that count; None if all count.
+    image, photograph: planes, [3, rows, stride]; mask: [1, rows, stride], 1 in unmasked pixels, or None.
     """
     residuals = workspace.array("residuals", (1, camera.rows, camera.stride))
     counts = workspace.array("residual numbers", BINS, np.uint32)

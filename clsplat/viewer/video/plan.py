@@ -144,7 +144,7 @@ def plan_video(
 ) -> VideoPlan:
     """Plan the video of a scene.  points: [M, 3], means of a model, or points of the scene.
 
-    is_moving: whether the model moves; origin: [3] world coordinates of the points' origin, by default the scene's.
+    is_moving: whether the model moves; origin: the points' origin, [3] world coordinates; default: the scene's origin.
     Raises ConfigError if the path needs a scene and there is none, or if times are set without motion, and DataError if
     the path is impossible in the scene.
     """
