@@ -119,7 +119,7 @@ def orange(p: Array) -> Array:
 
 
 def candy(p: Array) -> Array:
-    """Paint red and green stripes that wind around z, and rings on the ends; the half height is 0.26."""
+    """Paint red and green stripes that wind around z, and rings on the ends.  The half height is 0.26."""
     turn = (np.arctan2(p[1], p[0]) / (2 * np.pi) + p[2] / 0.16) % 1
     side = mix(mix((0.82, 0.79, 0.74), (0.65, 0.02, 0.03), turn < 0.45), (0.02, 0.3, 0.12), np.abs(turn - 0.72) < 0.05)
     ring = np.hypot(p[0], p[1]) / 0.03 % 1 < 0.5

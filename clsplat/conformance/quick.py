@@ -41,8 +41,8 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     """Compare the essential kernels with the reference, on the first use of a device, driver and kernel version.
 
     The checks run in a child process, so that the state of the open device does not change.  The bitonic sort is
-    checked if the run may choose it.  Raises DeviceError if the device computes wrongly, and MemoryLimitError if it has
-    too little memory.
+    checked if the run may choose it.  Raises DeviceError if the results of the device are wrong, and MemoryLimitError
+    if it has too little memory.
     """
     info, schedule = device.info, device.schedule
     bitonic = resolve_sort(device, sort) != "radix"

@@ -137,7 +137,7 @@ def safe_case(
     change: Callable[[dict[str, NDArray[Any]]], None] = lambda parameters: None,
     **changes: Any,
 ) -> Case:
-    """Return a random case in which no pixel is within `margin` of a threshold: float32 and float64 blend alike.
+    """Return a random case in which no pixel is within `margin` of a threshold, so float32 and float64 blend alike.
 
     change: function that edits the parameters of each candidate in place.
     """

@@ -266,7 +266,7 @@ _WINDOWS_NAMES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9Â¹Â
 
 
 def invalid_name_reason(name: str) -> str | None:
-    """Return why a file name is not portable, or None if it is."""
+    """Return the reason why a file name is not portable, or None if it is portable."""
     try:
         size = len(name.encode())
     except UnicodeEncodeError:

@@ -229,7 +229,7 @@ def _acquire(path: Path, folder: Path) -> io.FileIO:
 
 
 def _open_lock_file(path: Path) -> tuple[io.FileIO | None, bool]:
-    """Return an open lock file, or None if its owner is removing it, and whether this process created it."""
+    """Return an open lock file (None if its owner is removing it), and whether this process created it."""
     with suppress(FileExistsError):
         return path.open("x+b", buffering=0), True
     with suppress(FileNotFoundError):
@@ -263,7 +263,7 @@ def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> 
 
 
 def _require_exited_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Return the owner on a file system without locks.  Raises OutputError unless that process has exited."""
+    """Return the owner of a folder on a file system without locks.  Raises OutputError unless it has exited."""
     owner = read_owner(file)
     if not _has_exited(Owner.from_record(owner)):
         raise OutputError(

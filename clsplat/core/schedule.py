@@ -117,7 +117,7 @@ class Decay(Curve):
 
 
 class Every(Curve):
-    """A value at every N-th step and 0 at the others, such as a learning rate for rare updates."""
+    """A value at every N-th step and 0 at all other steps, such as a learning rate for rare updates."""
 
     every: Annotated[int, Field(gt=0)]
     """Interval in steps."""
@@ -226,5 +226,5 @@ def fire_steps(every: float, start: int, stop: int) -> list[int]:
 
 @lru_cache(maxsize=1024)
 def _ratio(every: float) -> tuple[int, int]:
-    """Return the interval, in decimal notation, as an exact ratio, so that coinciding events keep coinciding."""
+    """Return the interval, in decimal notation, as an exact ratio, so that events at the same step stay together."""
     return Fraction(str(every)).as_integer_ratio()

@@ -145,7 +145,7 @@ class Edit:
         )
 
     def matching_threshold(self, statistic: str, other: str, gradient_above: float) -> float:
-        """Return the threshold on `statistic` that as many Gaussians reach as reach `gradient_above` in `other`."""
+        """Return the threshold that as many Gaussians reach in `statistic` as reach `gradient_above` in `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
         fraction = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))

@@ -148,7 +148,7 @@ class SplatStats:
 
     @property
     def pixel_sums(self) -> int:
-        """Number of sums over pixels that the backward pass must compute for these statistics."""
+        """The number of sums over pixels that the backward pass must compute for these statistics."""
         return max((column.pixel_sums for column in self.columns.values()), default=PIXEL_SUMS)
 
     def total(self, name: str) -> Array:

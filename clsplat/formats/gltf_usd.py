@@ -197,7 +197,7 @@ class Gltf:
         return np.maximum(rows / np.float32(np.iinfo(kind).max), -1).astype(np.float32)
 
     def _view(self, number: Any, stride: int = 0) -> tuple[bytes, int, int, int]:
-        """Return a buffer, and the offset, length, and stride of a view in it, bytes.  stride: the default."""
+        """Return a buffer, and the offset, length, and stride in bytes of a view in it.  stride: the default stride."""
         view = self.tree["bufferViews"][_index(number)]
         if compressions := [name for name in view.get("extensions", {}) if "compression" in name]:
             raise DataError(f"{self.path}: is compressed with {quote(compressions[0])}; export it without compression")

@@ -74,7 +74,7 @@ class _Cells:
 
 
 def _prefix_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return prefix sums, [N + 1], with 0 at the middle index, where they are therefore most precise."""
+    """Return prefix sums, [N + 1].  They are 0 at the middle index, and therefore most precise around it."""
     middle = len(values) // 2
     lower, upper = np.cumsum(values[:middle][::-1])[::-1], np.cumsum(values[middle:])
     return np.concatenate([-lower, [0.0], upper])

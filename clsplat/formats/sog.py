@@ -411,7 +411,7 @@ def _means(p: Parameters, image: Any) -> dict[str, Any]:
 
 
 def _alpha(p: Parameters) -> NDArray[np.float64]:
-    """Return opacities from 1 to 255, [N]; not 0, because lossless WebP drops the colors of transparent pixels."""
+    """Return opacities from 1 to 255, [N].  0 is not used, because lossless WebP drops colors of transparent pixels."""
     return np.maximum(np.rint(255 * opacities(p["logit_opacity"][:, 0])), 1)
 
 

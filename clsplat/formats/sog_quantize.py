@@ -95,13 +95,13 @@ ROWS = 1 << 15  # rows rounded at once
 
 
 def quantization_steps(log_weights: NDArray[np.float64], median: float, max_step: float) -> NDArray[np.float32]:
-    """Return power-of-two steps, [N], from 1 to `max_step`; Gaussians of median weight get about `median`."""
+    """Return power-of-two steps, [N], from 1 to `max_step`.  Gaussians of median weight get about `median`."""
     exponents = np.rint(np.log2(median) - log_weights / 2)
     return np.asarray(np.exp2(np.clip(exponents, 0, np.log2(max_step))), np.float32)
 
 
 def scaled_step(rest: Floats, step: float, max_step: float) -> float:
-    """Return `step`, which suits SH with an RMS of TYPICAL_RMS, scaled to the RMS of `rest`, and at most `max_step`."""
+    """Scale `step`, which is for SH with an RMS of TYPICAL_RMS, to the RMS of `rest`.  Return at most `max_step`."""
     size = float(np.sqrt(np.square(np.clip(rest, -1, 1), dtype=np.float64).mean())) if rest.size else 0.0
     return min(max_step, step * max(size / TYPICAL_RMS, 1e-3))
 

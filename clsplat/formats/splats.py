@@ -177,12 +177,12 @@ def logits(alpha: Floats) -> NDArray[np.float32]:
 
 
 def opacities(logit: Floats) -> NDArray[np.float64]:
-    """Return the opacities in [0, 1] of logits, exact to 1e-16."""
+    """Convert logits to opacities in [0, 1], exact to 1e-16."""
     return np.asarray(0.5 + 0.5 * np.tanh(0.5 * logit.astype(np.float64)))
 
 
 def inverse_opacities(logit: Floats) -> NDArray[np.float64]:
-    """Return 1 / opacity of logits, precise for faint Gaussians and always finite."""
+    """Convert logits to 1 / opacity, precise for faint Gaussians and always finite."""
     return np.asarray(1 + np.exp(np.minimum(-logit.astype(np.float64), MAX_EXPONENT)))
 
 

@@ -242,7 +242,7 @@ def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
 
 
 def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: Writing) -> NDArray[np.float32]:
-    """Return the rounding step of each Gaussian's SH, [N], in levels of 1/128; all are 1 for quality `high`."""
+    """Return the rounding step of each Gaussian's SH, [N], in levels of 1/128; all steps are 1 for quality `high`."""
     max_step = LARGEST_STEP[options.quality]
     if max_step == 1 or not rest.shape[1]:
         return np.ones(len(rest), np.float32)

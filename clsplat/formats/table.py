@@ -183,7 +183,7 @@ CODECS = (
 
 
 def endings(reads: bool = False) -> list[str]:
-    """Return the file name endings of the formats that can be written, or with `reads`, that can be read."""
+    """Return the file name endings of the formats that can be written, or with `reads`, of those that can be read."""
     return [end for codec in CODECS if (codec.read if reads else codec.write) for end in codec.endings]
 
 

@@ -45,7 +45,7 @@ SHARED = ("near", "screen_variance", "background", "alpha")  # rendering paramet
 def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     """Merge all Gaussians into one model, with the first model's rendering parameters and the largest SH degree.
 
-    World filters are baked unless all models have one; if some models move, the others get a static motion.
+    World filters are baked unless all models have one.  If some models move, the others get a static motion.
     Raises DataError if the models use different screen filters or incompatible motions.
     """
     first = models[0]
@@ -231,7 +231,7 @@ def check_degree(degree: int | None) -> int | None:
 
 
 def _extract_frame(model: Model, time: float) -> Model:
-    """Return a moving model at one time.  Raises ConfigError for a static one, DataError if nothing is visible."""
+    """Return a moving model at one time.  Raises ConfigError for a static model, DataError if nothing is visible."""
     if model.motion is None:
         raise ConfigError("the model does not move; omit --time and --frames")
     frame = model.at(time)

@@ -310,7 +310,7 @@ class Model:
         return digest
 
     def _in_world(self, path: Path) -> SplatFile:
-        """Return the file content in world coordinates; means are float64 if float32 is too coarse."""
+        """Return the file content in world coordinates.  The means are float64 if float32 is too coarse."""
         if not self.origin.any():
             LOG.warning("%s: the model has no origin; its coordinates are written unchanged", path)
             return self.to_splat_file()

@@ -84,7 +84,7 @@ class PruneRedundant(Rule):
 
 
 class ErrorGain(Statistic):
-    """Error that a Gaussian can remove over all training views, in units of the mean error of a pixel (ours).
+    """Error that a Gaussian can remove over all training views, in units of the mean error of a pixel.
 
     It is the change of the loss when the Gaussian moves by one standard deviation on the screen.  The unit does not
     depend on the exposure, size, and number of the images, nor on the weights of the losses.

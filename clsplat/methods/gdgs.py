@@ -1,4 +1,4 @@
-"""Add Gaussians in dense regions with large gradients (our reading of GDGS, Wang & Shan 2025)."""
+"""Add Gaussians in dense regions with large gradients (an interpretation of GDGS, Wang and Shan 2025)."""
 
 from typing import Annotated, ClassVar, Literal
 

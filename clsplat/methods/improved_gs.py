@@ -92,8 +92,8 @@ class SplitLongAxis(Rule):
 class PruneLowestOpacity(Rule):
     """Remove the fraction of Gaussians with the lowest opacities.
 
-    Use it some steps after a reset of all opacities: Gaussians that many views need have recovered by then, and the
-    faintest ones fit only a few views.
+    Use it some steps after a reset of all opacities.  Gaussians that many views need have then recovered, and the
+    faintest Gaussians fit only a few views.
     """
 
     type: Literal["prune_lowest_opacity"] = "prune_lowest_opacity"

@@ -48,7 +48,7 @@ class RenderedTexture(Statistic):
 
 
 class Subdivide(Rule):
-    """Base class of rules that replace a limited fraction of the Gaussians by smaller ones."""
+    """Base class of rules that replace a limited fraction of the Gaussians with smaller ones."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"children", "beta", "max_fraction", "radius_above"})
 

@@ -45,8 +45,8 @@ def find_unneeded(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
 class PruneUseless(Rule):
     """Remove Gaussians that are useful in few training views, and the Gaussians with the smallest weights.
 
-    The weight of a Gaussian in a view is the sum of alpha T over its pixels.  The heaviest ones that together make up
-    `weight_per_view` of the view's weight are useful in it.
+    The weight of a Gaussian in a view is the sum of alpha T over its pixels.  The heaviest Gaussians that together make
+    up `weight_per_view` of the view's weight are useful in the view.
     """
 
     type: Literal["prune_useless"] = "prune_useless"

@@ -218,7 +218,7 @@ class FieldShape(Settings):
 
     @property
     def parameters(self) -> int:
-        """Length of the table of parameters, rounded up to full lines."""
+        """The length of the table of parameters, rounded up to full lines."""
         return self.network_parameters + (-(-self.grid.parameter_count // LINE) * LINE if self.grid else 0)
 
     @property

@@ -76,7 +76,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def platforms() -> list[Any]:
-    """Return the platforms of the loader; an empty list if it finds no runtime.  Raises like `check_runtimes`."""
+    """Return the platforms of the loader, or an empty list without runtimes.  Raises the errors of `check_runtimes`."""
     runtimes.check_runtimes(f"{cl.VERSION_TEXT} {cl.__file__}")
     with _warn_on_error("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
         return list(cl.get_platforms())
@@ -166,7 +166,7 @@ def _find_by_name(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
 
 
 def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "simt"]:
-    """Return the schedule for a device; `auto` is wide for CPUs with vectors of 8 floats or more, else simt."""
+    """Return the schedule for a device.  `auto` is `wide` for CPUs with vectors of 8 floats or more, else `simt`."""
     if schedule == "auto":
         return "wide" if info.kind == "CPU" and info.float_width >= 8 else "simt"
     if schedule not in ("wide", "simt"):

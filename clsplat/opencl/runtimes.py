@@ -134,7 +134,7 @@ def _find_faulty_driver(drivers: Mapping[Path, str], fault: str) -> DeviceError:
 
 
 def _loading_fault(variables: Mapping[str, str]) -> str | None:
-    """Load all runtimes in a child process; return how it fails, as a verb phrase, or None if it lists the devices."""
+    """Load all runtimes in a child process.  Return its failure as a verb phrase, or None if it lists the devices."""
     result = run_module(PROBE_MODULE, seconds=LOADING_SECONDS, variables=variables)
     if LOADED in result.output or LOADING not in result.output:  # without the first line, loading did not start
         return None

@@ -102,7 +102,7 @@ class Photographs:
         self._transparency = False
 
     def keep_transparency(self) -> None:
-        """Load the transparency of photographs too, which random backgrounds need."""
+        """Also load the transparency of photographs, which random backgrounds need."""
         if not self._transparency:
             self._transparency = True
             self._cache.clear()

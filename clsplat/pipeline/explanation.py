@@ -170,7 +170,7 @@ def _nearest(name: str, names: list[str]) -> str:
 
 
 def _describe_kind(annotation: Any) -> str:
-    """Return the name of a field's base class in words, such as 'world filter' for variants of WorldFilter."""
+    """Return the name of a field's base class as words, such as 'world filter' for variants of WorldFilter."""
     base = bases(annotation)[0]
     family = base.__mro__[base.__mro__.index(Settings) - 1]
     return re.sub(r"(?<=\w)(?=[A-Z])", " ", family.__name__).lower()

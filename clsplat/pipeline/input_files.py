@@ -38,7 +38,7 @@ def with_absolute_paths(pipeline: Pipeline) -> Pipeline:
 
 
 def content_hashes(pipeline: Pipeline) -> dict[str, str]:
-    """Return the hashes of the readable input files, by the text of their paths in the pipeline."""
+    """Return the hashes of the readable input files, keyed by their paths as written in the pipeline."""
     hashes: dict[str, str] = {}
 
     def add(text: str, path: Path) -> str:

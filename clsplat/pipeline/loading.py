@@ -88,7 +88,7 @@ class Pipeline:
 
 
 def prepared_folder(out: Path) -> Path:
-    """Return the folder for the results of `prepare:`, next to the run folder `out` and shared by the runs there."""
+    """Return the folder for the results of `prepare:`, which is next to `out` and shared by all run folders there."""
     return out.absolute().parent / PREPARED
 
 
@@ -144,7 +144,7 @@ def _validate(data: dict[str, Any], path: Path, document: Document) -> PipelineF
 
 
 def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
-    """Raise the error of the file without overrides, or else the error of the first invalid override."""
+    """Raise the error of the file without overrides, if any, or else the error of the first invalid override."""
     all_paths = [key.key_path for key in list_keys(_validate(data, path, document))]
     conflict: tuple[str, ConfigError] | None = None  # by the override that caused it; a later one may resolve it
     for override in overrides:

@@ -112,7 +112,7 @@ def differences(recorded: Mapping[str, str]) -> list[str]:
 
 
 def digest_of(*modules: Path) -> str:
-    """Return the SHA-256 of Python files and of the kernel files and headers next to them that they name."""
+    """Return the SHA-256 of Python files, and of the kernel files and headers next to them that they refer to."""
     digest, queue = sha256(), list(dict.fromkeys(modules))
     visited_files = set(queue)
     while queue:
@@ -185,7 +185,7 @@ def _is_within(module: str, package: str) -> bool:
 
 
 def _root_package(module: ModuleType) -> ModuleType:
-    """Return the outermost package of a module that is not a namespace package, or the module itself."""
+    """Return the outermost package of a module, except namespace packages, or the module itself."""
     parts = module.__name__.split(".")
     packages = [sys.modules[".".join(parts[:i])] for i in range(1, len(parts) + 1)]
     return next((package for package in packages if package.__file__), module)

@@ -82,8 +82,8 @@ class Axis:
 def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
     """Return settings with another number of training steps, without changing the first `done` steps.
 
-    Steps up to the last edit also stay as they are, if `steps` is larger.  Stages that start later start at the same
-    fraction of the remaining steps.
+    If `steps` is larger than the last edit, the steps up to that edit do not change either.  Stages that start later
+    start at the same fraction of the remaining steps.
     """
 
     def change(training: Training) -> Training:

@@ -51,7 +51,7 @@ class Auto(Backdrop):
 
     Before training, the photographs are searched for sky: smooth, bright or blue regions that touch the upper edge and
     are far from all points of the dataset.  A photograph with more than a quarter of such pixels below the horizon
-    counts as one without sky.  If no sky is chosen, the model is bit-identical to one without this key.
+    counts as a photograph without sky.  If no sky is chosen, the model is bit-identical to one without this key.
     """
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})

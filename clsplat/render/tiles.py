@@ -133,7 +133,7 @@ class Tiler:
         return TileLists(pairs, pair_splat, first_pair, tile_count, tile_offset, tile_pairs)
 
     def _large_arguments(self, splats: Array, footprints: Footprints, band: Band, count: int) -> dict[str, Any]:
-        """Return the arguments of both kernels for large splats; on GPUs, each work-item checks one splat."""
+        """Return the arguments of both kernels for large splats.  On GPUs, each work-item checks one splat."""
         run = self._team if self._team > 1 else self._runs(count, min_run=1 << 8)[0]
         arguments = {"groups": -(-count // run), "run": run, "count": count}
         arguments |= {"tiles_x": band.tiles_x, "row_begin": band.row_begin, "row_end": band.row_end}

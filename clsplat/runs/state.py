@@ -82,7 +82,7 @@ class RunState:
         return damaged_files(self.out, self.sums)
 
     def difference(self, pipeline: Pipeline) -> str:
-        """Return how another pipeline differs from that of the run; "" if they are the same.
+        """Return the difference between another pipeline and the run's pipeline as text, or "" if they are the same.
 
         If the pipeline of the run cannot be read, the result is the reason.
         """
@@ -134,7 +134,7 @@ def has_pipeline(folder: Path) -> bool:
 
 
 def _difference(old_pipeline: Pipeline, new_pipeline: Pipeline) -> Difference | None:
-    """Return the first setting that differs, except for automatic choices of the run.  Raises ConfigError."""
+    """Return the first setting that differs, ignoring automatic choices of the run.  Raises ConfigError."""
     decided_pipeline = with_decisions(new_pipeline, old_pipeline.decisions)
     old_settings, new_settings = (without_auto(pipeline.resolved()) for pipeline in (old_pipeline, decided_pipeline))
     return first_difference({**old_settings, "adapt": None}, {**new_settings, "adapt": None})

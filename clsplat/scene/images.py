@@ -382,7 +382,7 @@ def make_exposure(seconds: object, aperture: object, iso: object) -> CameraExpos
 
 
 def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]) -> None:
-    """Write the known exposures of the images in a folder, by name; write no file if there are none.
+    """Write the known exposures of the images in a folder, by name.  Without exposures, no file is written.
 
     Raises OutputError.
     """

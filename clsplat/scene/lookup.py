@@ -255,7 +255,7 @@ def _stem(name: str) -> str:
 
 
 def _keys(parts: Parts) -> set[str]:
-    """Return the possible stems of the file of a name: `a.jpg.png`, `a.jpg` and `a` for `a.jpg.png`."""
+    """Return the possible stems of a name's file, such as `a.jpg.png`, `a.jpg` and `a` for `a.jpg.png`."""
     return {parts[-1], _stem(parts[-1]), _stem(_stem(parts[-1]))} if parts else set()
 
 

@@ -36,7 +36,7 @@ class Surface:
     step: float  # difference of inverse depth between planes, 1 / scene units
 
     def is_new(self, points: Floats) -> NDArray[np.bool_]:
-        """Return which pixels, [H, W], show a surface that none of the points, [M, 3], covers or hides.
+        """Return a mask, [H, W], of the pixels with a surface that none of the points, [M, 3], covers or hides.
 
         A point covers the pixel that it projects to, unless the surface in that pixel is more than a plane nearer.
         """

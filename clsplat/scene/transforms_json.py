@@ -308,7 +308,7 @@ TRAIN_FILE, TEST_FILE = "transforms_train.json", "transforms_test.json"
 
 
 class BlenderReader(Reader):
-    """Read a Blender scene; the test views are those of transforms_test.json, or none without that file.
+    """Read a Blender scene.  The test views are those of transforms_test.json; without that file, there are none.
 
     With a `time` in every frame of both files, the scene is dynamic (D-NeRF): the first timestamp is 0, the last is 1.
     """

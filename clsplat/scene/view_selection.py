@@ -346,7 +346,7 @@ def _select(
 
 
 def _validation_fold(scene: Scene) -> set[int]:
-    """Return the indices of the views of every 8th training photograph, sorted by name; at least two photographs."""
+    """Return the view indices of every 8th training photograph, sorted by name.  At least two are held out."""
     names = [photograph_name(scene.views[i].name) for i in scene.train]
     order = sorted(set(names))
     count = len(order)

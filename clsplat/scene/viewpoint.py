@@ -32,7 +32,7 @@ class Viewpoint:
 
     @classmethod
     def from_points(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Viewpoint":
-        """Return a viewpoint that starts at `first`, or outside of most points without `first` or without views.
+        """Return a viewpoint that starts at `first`.  Without `first` or views, it starts outside of most points.
 
         points: the centers of the splats, [N, 3].
         """

@@ -84,7 +84,7 @@ class ValidatedTraining(Training):
 
     @property
     def min_steps(self) -> int:
-        """Smallest number of steps, including a refit, which is reached if the first measurement is the best one."""
+        """The smallest number of steps, including a refit.  It is reached if the first measurement is the best."""
         if self.patience is None:
             return self.steps
         every = self.measurements(getattr(self, "during", ()))[-1].every or self.steps

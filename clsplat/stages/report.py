@@ -198,7 +198,7 @@ class ViewFigure:
 
 
 def views(run: Run) -> dict[str, list[ViewFigure]]:
-    """Return images of the best and the worst views of the last evaluation, by heading."""
+    """Return images of the best and the worst views of the last evaluation, keyed by heading."""
     by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
     lines = [r for r in run.records.read("view") if r["downscale"] == run.downscale and r["step"] == run.model_step]
     latest = {r["view"]: r for r in lines if r["view"] in by_name}  # a view may be measured twice at the same step

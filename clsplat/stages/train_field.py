@@ -74,7 +74,7 @@ class TrainField(Training):
     def check_run(self, run: Run) -> None:
         """Check the run before the field is created.
 
-        Raises ConfigError if no camera sees the grid, MemoryLimitError if the field does not fit, and the errors of
+        Raises ConfigError if no camera shows the grid, MemoryLimitError if the field does not fit, and the errors of
         the stages in `during`.
         """
         super().check_run(run)

@@ -92,7 +92,7 @@ class Batch:
         self._count, self._last_report = Count("steps", sum(self._steps.values())), time.monotonic()
 
     def ready(self) -> None:
-        """Do something before the first cell starts; called once."""
+        """Prepare for the first cell.  Called once, before the cell starts."""
 
     def on_change(self, started: str | None) -> None:
         """React to a change.  started: name of the cell that has started; None: a cell has ended."""

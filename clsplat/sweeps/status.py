@@ -1,4 +1,4 @@
-"""Report the state of a store, from the files in it."""
+"""Report the state of a store from its files."""
 
 import time
 from contextlib import suppress

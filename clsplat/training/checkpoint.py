@@ -353,7 +353,7 @@ def _check_metrics(metrics: Metrics) -> None:
 
 
 def restore(run: Run) -> tuple[Path | None, list[str]]:
-    """Restore the newest valid checkpoint; return its path, or None without a checkpoint, and remarks to log.
+    """Restore the newest valid checkpoint; return its path (None if there is no checkpoint) and remarks to log.
 
     The remarks report changes of settings and of the device.  Raises ConfigError for a change of a setting that cannot
     change on resume, or for another format; OutputError if all checkpoints are damaged or missing.

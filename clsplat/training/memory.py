@@ -92,7 +92,7 @@ class DeviceLimits(Protocol):
 
 
 def offload_target(harmonics: Harmonics, limits: DeviceLimits) -> Location:
-    """Return where harmonics may be stored; `auto` does not offload them if the device shares the host's memory."""
+    """Return where harmonics may be stored.  `auto` does not offload them if the device shares the host's memory."""
     return "host" if harmonics == "host" or (harmonics == "auto" and not limits.unified) else "device"
 
 

@@ -165,7 +165,7 @@ class Run:
         self.is_consistent = was_consistent
 
     def add_training_time(self, start: tuple[float, float]) -> float:
-        """Add the time since `start`, a result of `clocks`, to the training time; return the wall-clock seconds."""
+        """Add the time since `start`, a result of `clocks`, to the training time.  Return the wall-clock seconds."""
         seconds, cpu = (end - begin for end, begin in zip(clocks(), start, strict=True))
         self.train_seconds += seconds
         self.cpu_seconds += cpu
@@ -268,7 +268,7 @@ def sky_center(run: Run) -> NDArray[np.float64]:
 
 
 def _rendering(run: Run) -> dict[str, Any]:
-    """Return the settings with which viewers render the model as in training."""
+    """Return the rendering settings that viewers need to render the model as in training."""
     model = run.model
     rendering: dict[str, Any] = {
         "near": model.near,

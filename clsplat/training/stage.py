@@ -127,7 +127,7 @@ class Scheduled(Stage):
         return step > self.start and (self.stop is None or step < self.stop)
 
     def is_overdue(self, run: Run) -> bool:
-        """Return whether the stage must run now in addition to its cadence; only for stages that do not change results."""
+        """Return whether to run the stage now in addition to its cadence; only for stages that never change results."""
         return False
 
     def stale(self, run: Run) -> Collection[str]:

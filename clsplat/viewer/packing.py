@@ -174,7 +174,7 @@ def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArra
 
 
 def _motion_header(columns: int) -> dict[str, int]:
-    """Return the number of columns, of powers of time above the first, and the first column of the rotation or 0."""
+    """Return the number of columns, of powers of time above the first, and the first column of the rotation, or 0."""
     rotation = motion_fields(columns).get("turn")
     return {"columns": columns, "bends": motion_degree(columns) - 1, "turns": rotation.start if rotation else 0}
 

@@ -1,1 +1,1 @@
-"""Models made from models: blocks, levels of detail, compression, further training."""
+"""Create models from models: blocks, levels of detail, compression, further training."""

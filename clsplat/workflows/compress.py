@@ -143,7 +143,7 @@ class CompressionTarget:
 
     @property
     def remedy(self) -> str:
-        """What to do if no file meets the target."""
+        """The remedy if no file meets the target."""
         if self.max_bytes is not None:
             return "give a larger size, or smaller fractions with --keep"
         return "allow a larger loss, or train longer with --steps"

@@ -91,7 +91,7 @@ def _status(folder: Path) -> dict[str, Any]:
 
 
 def _check_files(out: Path, is_done: bool) -> Iterator[dict[str, Any]]:
-    """Yield the result of verifying each file; when the scene is done, all files must exist."""
+    """Yield the result of verifying each file.  If the scene is done, all files must exist."""
 
     def describe_manifest(path: Path) -> str:
         data = read_json(path)

@@ -145,7 +145,7 @@ def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
 
 
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
-    """Return the cost of merging each pair, [pairs]; symmetric up to rounding."""
+    """Return the cost of merging each pair, [pairs].  It is symmetric up to rounding."""
     mass, log_volume = masses(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows, computed once
     blocks = [slice(start, start + BLOCK) for start in range(0, len(first), BLOCK)]
     return np.concatenate([_block_cost(tables, mass, log_volume, first[block], second[block]) for block in blocks])

@@ -357,7 +357,7 @@ class _Comparison:
 
 @CHECKS.add("place_colors")
 def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
-    """Check that each pixel of an image is at its position, and that the padding is zero."""
+    """Check that each pixel of an image is at the correct position, and that the padding is zero."""
     case = FieldCase.sample(device, rng, 1, Draw(0, 1, 0))
     field = Field(case.shape, case.device_parameters, device.upload(BACKGROUND))
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)

@@ -77,7 +77,7 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
 
 
 def check_cover(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
-    """Compare the loss of Gaussians that cover the sky; no pixel is close to the threshold on color differences."""
+    """Compare the loss of Gaussians that cover the sky.  No pixel is close to the threshold on color differences."""
     view, label, difference, weight = SkyView(device, rng, width, height, side), f"{width} x {height} px", 0.02, 0.3
     sky = ref.sky_image(view.texels.astype(np.float64), view.directions)
     distance = np.where(rng.random((height, width)) < 0.3, 2.0, 0.4) * difference

@@ -31,7 +31,7 @@ def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
 
 
 def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
-    """Compare a stable sort of keys, all of them below 2^bits."""
+    """Compare a stable sort of keys below 2^bits."""
     sorted_keys, order = make_tiler(device).sort_pairs(device.upload(keys), bits, len(keys), "test")
     expected = np.argsort(keys, kind="stable")
     yield match("radix_scatter", f"positions of {len(keys)} keys of {bits} bits", order.get(), expected)
@@ -124,8 +124,8 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
 def _max_alpha(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the largest alpha of each record in each tile, and whether it determines if the pair is allowed, [T, N].
 
-    For tiles at the edge of the image and for splats thinner than a few pixels, it does not: their pairs may be listed
-    although they reach no pixel.
+    The alpha does not determine it for tiles at the edge of the image and for splats thinner than a few pixels, whose
+    pairs may be listed although they reach no pixel.
     """
     records, camera = frame.splats.get().astype(np.float64), frame.camera
     (width, height), tile = case.size, camera.tile

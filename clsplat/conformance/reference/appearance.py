@@ -92,7 +92,7 @@ def apply_color_matrix(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any
 def color_matrix_backward(
     image: NDArray[Any], matrix: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * output) with respect to image and matrix, zero through clamped values."""
+    """Return the gradients of sum(gradient * output) with respect to image and matrix; zero for clamped values."""
     upstream = np.where(_transform(image, matrix) < 1, gradient, 0)
     grad_image = np.einsum("ab,ahw->bhw", matrix[:, :3], upstream)
     homogeneous = np.concatenate([image, np.ones((1, *image.shape[1:]))])

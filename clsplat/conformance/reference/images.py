@@ -153,7 +153,7 @@ def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
 def haar_filter(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[Any]:
     """Analyze and synthesize an image along both axes.
 
-    Images of odd size repeat the last line.  Masked pixels are replaced by the mean of their 2 x 2 block.
+    Images of odd size repeat the last line.  Masked pixels are replaced with the mean of their 2 x 2 block.
     image: [3, H, W]; taps: [2]; mask: [H, W] bool.
     """
     _, height, width = image.shape

@@ -64,8 +64,8 @@ def move_gaussians_backward(
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return dL/d(motion), [N, W], and dL/d(logit_opacity), [N], from the gradients at a time.
 
-    The gradients of means and quaternions are the same at the time center as at the time.  Those of absent Gaussians
-    are zero.
+    The gradients of means and quaternions at the time are also those at the time center.  They are zero for absent
+    Gaussians.
     """
     grad_motion, grad_center = np.zeros_like(motion), np.zeros_like(logit_opacity)
     for n, row in enumerate(motion):

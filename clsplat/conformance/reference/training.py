@@ -179,7 +179,7 @@ def screen_splitting(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> NDArray[Any]:
-    """Return the sums over pixels of dL/dalpha times the Hessian of alpha by the splat's mean, [N, 2, 2] px⁻²."""
+    """Return the sums over pixels of dL/dalpha times the Hessian of alpha in the splat's mean, [N, 2, 2] px⁻²."""
     matrices = np.zeros((len(splats.opacity), 2, 2))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         a, b, c = splats.conic[step.splat]

@@ -298,7 +298,7 @@ class Facts:
 
     @property
     def unplaced(self) -> bool:
-        """Whether the dataset consists of photographs without cameras, which `clsplat run photos` can find."""
+        """Whether the dataset consists of photographs without cameras, for use with `clsplat run photos`."""
         return (
             self.kind == "none"
             and not self.faults

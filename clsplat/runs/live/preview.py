@@ -183,7 +183,7 @@ class Credit:
     """A time budget that grows by a fraction of the elapsed time, up to a limit."""
 
     def __init__(self, rate: float, limit: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """rate: credit per second.  limit: maximum credit, which bounds the time spent at once after a pause."""
+        """rate: credit per second.  limit: maximum credit, which bounds the time used at once after a pause."""
         self.rate, self.limit, self.spent = rate, limit, 0.0
         self._clock, self._credit, self._updated = clock, 0.0, clock()
         self._lock = threading.Lock()

@@ -210,7 +210,7 @@ def _is_below(key_path: str, key: str) -> bool:
 
 
 def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
-    """Return the name of a variant: the name of its pipeline, and the settings that most variants do not share."""
+    """Return the name of a variant: the name of its pipeline, and the settings in which it differs from most others."""
     siblings = [other for other in distinct if other.get("name") == settings.get("name")]
     descriptions: list[str] = []
     for key_path in differing_keys(siblings):

@@ -91,7 +91,7 @@ class Rig:
 
     @cached_property
     def depths(self) -> tuple[float, float]:
-        """Near and far, scene units: quantiles of the visible depths."""
+        """Near and far: quantiles of the visible depths, in scene units."""
         view_depths = [self._visible_depths(view) for view in self.views[:: -(-len(self.views) // 64)]]
         depths = np.concatenate(view_depths)
         if not len(depths):
