@@ -88,7 +88,7 @@ class RenderedView:
             gradient.fill(0)
         else:
             gradient.set((texture >= 0) * (np.arange(3) == channel)[:, None, None])
-        sums = self.rasterizer.pixel_sums(self.model, self.frame, gradient, _computed_sums(number), texture_array)
+        sums = self.rasterizer.pixel_sums(self.model, self.frame, gradient, _count_sums(number), texture_array)
         return np.asarray(sums.get()[number, : self.model.gaussians.count])
 
     @property
@@ -100,7 +100,7 @@ class RenderedView:
         return self.rasterizer.workspace.array("grad_image", (3, camera.rows, camera.stride))
 
 
-def _computed_sums(number: int) -> int:
+def _count_sums(number: int) -> int:
     """Return the number of sums that the backward pass must compute to include sum `number`."""
     return SQUARE + 1 if number >= BLENDED else BLENDED
 

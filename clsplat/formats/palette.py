@@ -24,9 +24,9 @@ def codebook(values: NDArray[np.floating], step: float | None = None) -> NDArray
     """
     sorted_values = np.sort(values.astype(np.float64) + 0.0, axis=None)  # makes -0 equal to 0, whose order is undefined
     for candidates in [sorted_values] + ([np.rint(sorted_values / step) * step] if step else []):
-        distinct = np.unique(candidates)
-        if len(distinct) <= ENTRIES:
-            return np.concatenate([distinct, np.full(ENTRIES - len(distinct), distinct[-1])])
+        unique_values = np.unique(candidates)
+        if len(unique_values) <= ENTRIES:
+            return np.concatenate([unique_values, np.full(ENTRIES - len(unique_values), unique_values[-1])])
     cells = _Cells(sorted_values)
     cuts = _first_cuts(sorted_values)
     for _ in range(CODEBOOK_ROUNDS):
@@ -104,8 +104,8 @@ def palette(
     sample of the points, and starts from evenly spaced ones.  A vector without points moves to the point with the
     largest error.  Points have at most 45 components.  weights: relative probabilities of sampling each point, [N].
     """
-    if (distinct := unique_points(points, entries)) is not None:
-        return distinct
+    if (exact_palette := unique_points(points, entries)) is not None:
+        return exact_palette
     integers = _to_integers(points)
     rows = _sample_rows(len(points), SAMPLE * entries, weights)
     sample, integer_sample = points[rows].astype(np.float64), integers[rows]
@@ -164,13 +164,13 @@ def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray
     """Return the distinct points in order of appearance and the label of each point; None if more than `max_points`."""
     if len(np.unique(points[:, 0])) > max_points:  # a fast test that suffices for most models
         return None
-    distinct, first, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)
-    if len(distinct) > max_points:
+    unique_rows, first, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    if len(unique_rows) > max_points:
         return None
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    return distinct[order].astype(np.float64), rank[labels.reshape(-1)]
+    return unique_rows[order].astype(np.float64), rank[labels.reshape(-1)]
 
 
 def robust_max(values: NDArray[np.float32]) -> np.float32:

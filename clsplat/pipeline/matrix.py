@@ -135,9 +135,9 @@ def load_experiment(
     document = read_yaml(path)
     if not isinstance(document.data, dict) or "matrix" not in document.data:
         return None
-    names_pipelines = isinstance(document.data["matrix"], dict) and document.data["matrix"].get("pipelines")
+    has_pipelines = isinstance(document.data["matrix"], dict) and document.data["matrix"].get("pipelines")
     try:
-        keys = document.data if names_pipelines else document.data.keys() & MatrixFile.model_fields.keys()
+        keys = document.data if has_pipelines else document.data.keys() & MatrixFile.model_fields.keys()
         file = MatrixFile.model_validate({key: document.data[key] for key in document.data if key in keys})
     except ValidationError as error:
         raise ConfigError(explain(error, MatrixFile, path, document)) from error

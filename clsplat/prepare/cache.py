@@ -73,7 +73,7 @@ def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
 
 
 def prepare(
-    planned: Sequence[PlannedStep],
+    steps: Sequence[PlannedStep],
     source: Path,
     root: Path,
     stage: Callable[[str], AbstractContextManager[Any]] = nullcontext,
@@ -82,10 +82,10 @@ def prepare(
 
     Raises OutputError when another process is computing one of the results, and the errors of the steps.
     """
-    count = Count("steps of the preparation", len(planned), is_even=False)
-    if reused_names := [planned_step.step.stage for planned_step in planned if not planned_step.reason]:
+    count = Count("steps of the preparation", len(steps), is_even=False)
+    if reused_names := [planned_step.step.stage for planned_step in steps if not planned_step.reason]:
         LOG.info("reusing the results of %s in %s", ", ".join(reused_names), root)
-    for i, planned_step in enumerate(planned):
+    for i, planned_step in enumerate(steps):
         with counts_as_debug():  # each step logs its own progress
             count.reach(i)
         with _lock_result(planned_step) if planned_step.reason else nullcontext():
@@ -126,9 +126,9 @@ def fingerprint(folder: Path, excluded_folder: Path) -> str:
     return _digest(entries)
 
 
-def make_note(planned: Sequence[PlannedStep]) -> dict[str, str]:
+def make_note(steps: Sequence[PlannedStep]) -> dict[str, str]:
     """Return the note that a run folder keeps: the hash of the prepared photographs, and their folder."""
-    return {"inputs": planned[-1].key, "folder": str(planned[-1].folder)}
+    return {"inputs": steps[-1].key, "folder": str(steps[-1].folder)}
 
 
 def read_note(out: Path) -> dict[str, str] | None:

@@ -26,7 +26,7 @@ def evaluate_motion(workspace: Workspace, model: DeviceModel, camera: DeviceCame
     if not gaussians.is_moving:
         return model
     if camera.time is None:
-        _warn_of_first_timestamp()
+        _warn_about_first_timestamp()
     stride = gaussians.capacity
     means, logit = workspace.array("moved means", (3, stride)), workspace.array("moved logit", (1, stride))
     gaussians.device.program("motion.cl").move_forward(
@@ -95,7 +95,7 @@ def _with_tables(gaussians: Gaussians, arrays: dict[str, Array]) -> Gaussians:
 
 
 @cache
-def _warn_of_first_timestamp() -> None:
+def _warn_about_first_timestamp() -> None:
     LOG.warning(
         "a view without a time shows a moving model at its first timestamp; set `--time T` in commands, or `View.time` "
         "in Python"

@@ -199,9 +199,9 @@ def view(
     source = next((ModelSource.from_model(path, scene) for path in models if scene is not None or find_run(path)), None)
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photos of a scene; add --scene, or use a run folder")
-    _warn_of_different_scenes(models, source)
+    _warn_about_different_scenes(models, source)
     by_name = dict(zip(names(models), map(load, counted(models, "models read", len(models))), strict=True))
-    _warn_of_size(by_name, splats)
+    _warn_about_size(by_name, splats)
     first_model = next(iter(by_name.values()))
     used_scene = source.scene(first_model).downscaled(source.settings.downscale) if source else None
     background = first_model.rendering.background or (used_scene.background if used_scene else "black")
@@ -227,7 +227,7 @@ def view(
     return out
 
 
-def _warn_of_size(models_by_name: Mapping[str, Model], splats: int | None) -> None:
+def _warn_about_size(models_by_name: Mapping[str, Model], splats: int | None) -> None:
     """Warn about models with too many splats for a page.  Call this before packing them, which takes minutes."""
     for name, model in models_by_name.items():
         if min(len(model), splats or len(model)) > MANY_SPLATS:
@@ -238,7 +238,7 @@ def _warn_of_size(models_by_name: Mapping[str, Model], splats: int | None) -> No
             )
 
 
-def _warn_of_different_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
+def _warn_about_different_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
     """Warn if the models are of different scenes, because the page has the cameras of only one scene."""
     scenes = {}
     for name, run in zip(names(models), map(find_run, models), strict=True):

@@ -94,7 +94,7 @@ def test_renderer_uses_the_time_of_the_view(finished, scene):
 def test_view_without_a_time_shows_time_0_with_a_warning(finished, scene, caplog):
     from clsplat.render import motion
 
-    motion._warn_of_first_timestamp.cache_clear()
+    motion._warn_about_first_timestamp.cache_clear()
     model, view = load(finished), clsplat.read_scene(scene).split("test")[0]
     renderer = Renderer(model)
     actual = [renderer.render(replace(view, time=time)).image for time in (None, 0.0, None)]

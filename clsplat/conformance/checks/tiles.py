@@ -48,13 +48,13 @@ def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, 
     depth_key = rng.integers(0, max_key, pairs).astype(np.uint32)
     pair_splat = np.arange(pairs, dtype=np.uint32)
     upload = device.upload
-    offsets, ordered = make_tiler(device, "bitonic")._sort_in_tiles(
+    offsets, sorted_pairs = make_tiler(device, "bitonic")._sort_in_tiles(
         upload(pair_tile), upload(pair_splat), upload(depth_key), pairs, tiles
     )
     actual = offsets.get()
     yield match("count_pairs", "offsets of tiles", actual, np.concatenate([[0], np.cumsum(lengths)]))
     expected = np.lexsort((pair_splat, depth_key, pair_tile))
-    yield match("sort_tiles", f"order of {pairs} pairs in {tiles} tiles", ordered.get(), expected)
+    yield match("sort_tiles", f"order of {pairs} pairs in {tiles} tiles", sorted_pairs.get(), expected)
 
 
 @CHECKS.add("scan_blocks", "scan_offsets")

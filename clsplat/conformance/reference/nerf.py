@@ -216,9 +216,9 @@ class HashLevel:
     def corners(self, positions: Floats) -> tuple[NDArray[np.int64], Floats]:
         """Return the entries of the corners around positions in the cube, and their weights, both [S, 8]."""
         cell = np.clip(np.floor(positions * self.cells), 0, self.cells - 1)
-        within = positions * self.cells - cell
+        fraction = positions * self.cells - cell
         sides = cell[:, None].astype(np.int64) + CORNERS
-        weights = np.where(CORNERS, within[:, None], 1 - within[:, None]).prod(axis=-1)
+        weights = np.where(CORNERS, fraction[:, None], 1 - fraction[:, None]).prod(axis=-1)
         if (self.cells + 1) ** 3 <= self.entries:
             return sides @ np.array([1, self.cells + 1, (self.cells + 1) ** 2]), weights
         hashes = np.bitwise_xor.reduce(sides.astype(np.uint64) * PRIMES & np.uint64(0xFFFFFFFF), axis=-1)

@@ -197,9 +197,9 @@ class CameraState(ModuleState):
         if not trained:
             return
         names = {view.name for view in self.views}
-        focal = self.settings.focal_rate(last, len({self.cameras[name] for name in names}))
-        self.rates = *self.settings.rates(last, len(names)), focal
-        if focal:
+        zoom_rate = self.settings.focal_rate(last, len({self.cameras[name] for name in names}))
+        self.rates = *self.settings.rates(last, len(names)), zoom_rate
+        if zoom_rate:
             require_zoom(run.original)
 
     def before_render(self, step: TrainingStep) -> None:
