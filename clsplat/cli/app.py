@@ -83,7 +83,7 @@ class Commands(TyperGroup):
 
 
 def examples(*lines: str) -> str:
-    """Return examples as the end of a help text."""
+    """Format examples for the end of a help text."""
     return "Examples:\n" + "\n".join(f"  {line}" for line in lines)
 
 

@@ -81,7 +81,7 @@ def inspect(
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Report problems of a dataset or photos, and whether they can be trained on; exit code 3 if not."""
+    """Report problems of a dataset or photos, and whether training can use them; exit code 3 if not."""
     from clsplat.prepare.inspect.findings import show
     from clsplat.workflows.blocks import table
 

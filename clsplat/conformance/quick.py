@@ -71,7 +71,7 @@ def remember(info: DeviceInfo, schedule: FixedSchedule, sorts: Sequence[str] = S
 
 
 def forget(info: DeviceInfo, schedule: FixedSchedule) -> None:
-    """Remove the records of a device that computes wrongly, so that the next run checks it again."""
+    """Remove the records of a device that computes wrong results, so that the next run checks it again."""
     for sort in SORTS:
         with suppress(OSError):
             _record_file(info, schedule, sort).unlink(missing_ok=True)

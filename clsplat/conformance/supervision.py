@@ -145,7 +145,7 @@ def _forward_lines(stdout: IO[str], lines: "queue.Queue[str | None]") -> None:
 
 
 def _exit_reason(process: "subprocess.Popen[str]", errors: IO[str]) -> str:
-    """Return why a process ended, as a sentence with its signal or exit code, and the last line that it wrote."""
+    """Return the reason why a process exited: its signal or exit code and the last line of its output."""
     try:
         code = process.wait(EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""Write files atomically: a reader sees a complete file or none, even after a power failure."""
+"""Write files atomically: a reader finds a complete file or no file, even after a power failure."""
 
 import errno
 import itertools

@@ -121,7 +121,7 @@ class Count:
 
 
 def counted(items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
-    """Yield the items and count them; an item is done when the next one is requested."""
+    """Yield the items and count them.  An item is done when the next one is requested."""
     count = Count(label, total)
     for done, item in enumerate(items, 1):
         yield item

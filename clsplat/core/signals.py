@@ -174,7 +174,7 @@ class Stream:
             _redirect_to_null(stream)
 
     def install(self) -> None:
-        """Replace the stream in `sys` by this wrapper."""
+        """Replace the stream in `sys` with this wrapper."""
         self.fault = None
         stream = self._raw
         if stream is None:  # closed before startup

@@ -77,7 +77,7 @@ def show(text: str) -> None:
 
 
 def show_json(data: Any) -> None:
-    """Print data as JSON.  Raises OutputError as `show` does."""
+    """Print data as JSON.  Raises the errors of `show`."""
     signals.STDOUT.write(json.dumps(data, indent=1) + "\n")
     signals.check_output()
 

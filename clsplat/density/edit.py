@@ -165,8 +165,8 @@ class Edit:
     ) -> None:
         """Set the outcome of the Gaussians of a mask, `chosen`, [N].
 
-        copies: number of rows that each becomes, a scalar or [N].  old_rows: how many of them are the old row, with its
-        moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.
+        copies: number of rows that replace each Gaussian, a scalar or [N].  old_rows: number of these that are the old
+        row, with its moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.
         Raises ValueError for a wrong shape or type, and for a number of rows below 0 or above MAX_ROWS.
         """
         count = self.gaussians.count

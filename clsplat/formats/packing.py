@@ -67,7 +67,7 @@ def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def warn_clipped(path: Path, name: str, ranges: str, is_clipped: NDArray[np.bool_]) -> None:
-    """Warn how many Gaussians have values outside a format's range.  is_clipped: mask of these values, [N, K]."""
+    """Warn about Gaussians with values outside a format's range.  is_clipped: mask of the values, [N, K]."""
     if count := int(is_clipped.any(axis=1).sum()):
         LOG.warning("%s: %s stores %s; values of %s Gaussians were clipped", path, name, ranges, f"{count:,}")
 
@@ -116,7 +116,7 @@ def decode(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int)
 
 
 def _rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Decode pixels, [n, 4]; the image may have no alpha channel if alpha is 255 everywhere."""
+    """Decode pixels, [n, 4].  An image in which alpha is 255 everywhere may have no alpha channel."""
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8 or image.ndim != 3:
         return np.zeros((0, 4), np.uint8)

@@ -46,7 +46,7 @@ class _Cells:
         self.sums, self.squares = _prefix_sums(offsets), _prefix_sums(np.square(offsets))
 
     def means(self, cuts: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the mean of each cell; for an empty cell, the value before it."""
+        """Return the mean of each cell.  The mean of an empty cell is the value before it."""
         first, last = cuts[:-1], cuts[1:]
         mean: NDArray[np.float64] = (self.sums[last] - self.sums[first]) / np.maximum(last - first, 1) + self.center
         return np.where(last > first, mean, self.sorted_values[np.maximum(first, 1) - 1])

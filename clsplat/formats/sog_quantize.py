@@ -268,8 +268,8 @@ MIN_INSIDE, MIN_BEHIND = 0.01, 0.05  # fractions of all Gaussians
 def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
     """Return the base-2 logarithms of each Gaussian's weight in renders, [N], from -LARGEST to LARGEST.
 
-    Their median is 0, and they do not depend on the scale of the model.  has_sky: whether some Gaussians are a sky,
-    which the median excludes.
+    Their median is 0, and they do not depend on the scale of the model.  has_sky: whether some Gaussians represent a
+    sky; these are excluded from the median.
     """
     if not len(p["means"]):
         return np.zeros(0)

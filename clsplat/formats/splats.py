@@ -171,7 +171,7 @@ def concatenate(parts: Sequence[Parameters]) -> Parameters:
 
 
 def logits(alpha: Floats) -> NDArray[np.float32]:
-    """Return the logits of opacities in [0, 1]; 0 and 1 become MIN_ALPHA and 1 - MIN_ALPHA."""
+    """Convert opacities in [0, 1] to logits.  0 and 1 are replaced with MIN_ALPHA and 1 - MIN_ALPHA."""
     clipped = np.clip(alpha.astype(np.float64), MIN_ALPHA, 1 - MIN_ALPHA)
     return np.asarray(np.log(clipped / (1 - clipped)), np.float32)
 
@@ -300,7 +300,7 @@ def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
 
 
 def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return the logarithms of scales; if most are negative, return them as logarithms, and add a note to `notes`."""
+    """Return the logarithms of scales.  If most are negative, assume that they are logarithms, and add to `notes`."""
     if np.count_nonzero(scales < 0) > MIN_OUTSIDE * scales.size:
         notes.add("its scales are negative: they are read as logarithms")
         return scales.astype(np.float32)
@@ -308,7 +308,7 @@ def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 
 def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return the logits of opacities; if most are outside [0, 1], return them as logits, and add a note to `notes`."""
+    """Return the logits of opacities.  If most are outside [0, 1], assume that they are logits, and add to `notes`."""
     if np.count_nonzero((alpha < 0) | (alpha > 1)) > MIN_OUTSIDE * alpha.size:
         notes.add("its opacities are outside of 0 to 1: they are read as logits")
         return alpha.astype(np.float32)

@@ -169,7 +169,7 @@ def _unpack_4_byte_quats(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) -> int:
-    """Return the number of fractional bits with which all positions fit into 24 bits; warn if it is small.
+    """Return the number of fractional bits with which all positions fit into 24 bits, and warn if it is small.
 
     Raises DataError if positions do not fit even without fractional bits.
     """

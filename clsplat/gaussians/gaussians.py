@@ -227,7 +227,7 @@ class Gaussians:
         return not_finite(self)
 
     def rearrange(self, source: Array, fresh: Array, count: int) -> None:
-        """Replace row i of every table by its row source[i]; set moments and statistics of fresh rows to zero.
+        """Replace row i of every table with its row source[i]; set moments and statistics of fresh rows to zero.
 
         source, fresh: [count] uint32; fresh is 1 for new rows.  No other operation changes the number of Gaussians.
         """
@@ -286,7 +286,7 @@ HIDDEN_VIEWS = 22  # bits per component; to_VI in lanes.h converts such integers
 
 
 def hide(gaussians: Gaussians, hidden: NDArray[np.bool_]) -> None:
-    """Write which Gaussians each training view hides, [V, N], into the table HIDDEN.
+    """Write the mask of the Gaussians that each training view hides, [V, N], into the table HIDDEN.
 
     View v has bit v % HIDDEN_VIEWS of component v // HIDDEN_VIEWS.
     """

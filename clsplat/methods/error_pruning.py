@@ -109,7 +109,7 @@ class ErrorGain(Statistic):
 
 
 class ViewError(Statistic):
-    """Error of all views, including views that do not see the Gaussian, measured by the losses."""
+    """Error of all views, including views in which the Gaussian is not visible, measured by the losses."""
 
     type: Literal["view_error"] = "view_error"
 

@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 
 def normalize_by_median(values: NDArray[np.floating]) -> Floats:
-    """Divide values by the median of the positive ones; return zeros if none is positive."""
+    """Divide values by the median of the positive values; return zeros if none is positive."""
     positive = values[values > 0]
     return np.asarray(values / np.median(positive), np.float64) if len(positive) else np.zeros(len(values))
 

@@ -247,9 +247,10 @@ HELD_OUT, OTHERS = "psnr_held_out_moments", "psnr_other_moments"
 def psnr_by_time(
     psnr: Mapping[str, float], views: Sequence[View], train_views: Sequence[View]
 ) -> dict[str, dict[str, float]]:
-    """Return the PSNR of each view in dB, by view name and key: HELD_OUT or, if training has its timestamp, OTHERS.
+    """Return the PSNR of each view in dB, by view name and key.
 
-    The result is empty if all views have the same key, as in static scenes.
+    The key is OTHERS if a training view has the same timestamp, otherwise HELD_OUT.  The result is empty if all views
+    have the same key, as in static scenes.
     """
     training_times, times = set(distinct_times(train_views)), {view.name: view.time for view in views}
     keys = {name: OTHERS if time in training_times else HELD_OUT for name, time in times.items() if time is not None}

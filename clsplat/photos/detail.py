@@ -73,8 +73,8 @@ def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Fl
 class DetailDivisor(Settings):
     """Increase the resolution with the frequency content of the photographs (DashGaussian, Chen et al. 2025).
 
-    Training starts at a size that keeps a quarter of the amplitudes of the spectrum.  Equal increments of the
-    amplitudes then take fewer and fewer steps.  The downscale factor is an integer that changes at edits.
+    Training starts at a size that keeps a quarter of the amplitudes of the spectrum.  Each increment of the
+    amplitudes then takes fewer steps than the previous one.  The downscale factor is an integer that changes at edits.
     """
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"until", "every", "start"})

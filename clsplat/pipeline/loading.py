@@ -204,7 +204,7 @@ def with_decisions(pipeline: Pipeline, decisions: Iterable[Decision]) -> Pipelin
 
 
 def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> PipelineFile:
-    """Add the keys that overrides set to `adapt.keep`.  Raises ConfigError if `adapt` decides an unknown key."""
+    """Add the keys set by overrides to `adapt.keep`.  Raises ConfigError if `adapt` decides an unknown key."""
     if (adapt := settings.adapt) is None:
         return settings
     keep, data, keys = adapt.keep, settings.model_dump(mode="json"), adapt.keys(settings.optimize)

@@ -84,7 +84,7 @@ class Matrix(Settings):
 
 
 class MatrixFile(Settings):
-    """The keys of a file with `matrix:`; without `matrix.pipelines` it has the keys of a pipeline as well."""
+    """The keys of a file with `matrix:`.  Without `matrix.pipelines`, it also has the keys of a pipeline."""
 
     name: Name
     """Name of the matrix, and of its run folder."""

@@ -115,7 +115,7 @@ class _Node:
         )
 
     def put(self, name: str, value: Any, text: str) -> None:
-        """Insert a list item of a type in order, or replace the item of that type; the value None removes it.
+        """Insert a list item of a type in order, or replace the item of that type.  The value None removes it.
 
         Raises OverrideError.
         """

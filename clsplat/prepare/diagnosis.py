@@ -37,7 +37,7 @@ class MatchGraph:
 
     @cached_property
     def matches(self) -> dict[str, dict[str, int]]:
-        """The number of verified matches of each photograph with each of the others."""
+        """The number of verified matches between each photograph and each of the others."""
         matches: dict[str, dict[str, int]] = {name: {} for name in self.features}
         for (a, b), count in self.pairs.items():
             matches[a][b] = matches[b][a] = count

@@ -119,7 +119,7 @@ def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, 
 
 
 def _field_estimate(training: TrainField, units: int) -> Estimate:
-    """Estimate the time of a stage that trains a field; all of its steps take the same time."""
+    """Estimate the time of a stage that trains a field.  All its steps take the same time."""
     shape = training.field
     samples = training.rays * (shape.coarse_samples + shape.fine_samples)
     sample_seconds = WEIGHT * shape.network_parameters + LEVEL * (shape.grid.levels if shape.grid else 0)

@@ -111,7 +111,7 @@ class RunState:
         return "optimize.steps"
 
     def note_on_longer_training(self) -> str:
-        """Describe how a continued training would differ from one planned with all its steps; "" if it would not."""
+        """Describe how a continued training differs from one planned with all steps, or return "" if it does not."""
         training = self.pipeline.settings.training
         steps = training.steps
         names = [s.stage for s in training.during if type(s).stale is not Scheduled.stale and s.is_due(steps)]

@@ -195,7 +195,7 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, deadline:
 
 
 def min_steps_of(pipeline: Pipeline) -> int:
-    """Return the minimum number of training steps: that of a rehearsal, or more to keep edits at different steps."""
+    """Return the minimum number of training steps: that of a rehearsal, or more if edits would coincide."""
     training = pipeline.settings.training
     return max(min(STEPS, training.rehearsal_steps), min_steps(training))
 

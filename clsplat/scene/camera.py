@@ -247,7 +247,7 @@ class Lens:
         return x, y, z
 
     def _sees(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
-        """Return which rays, in normalized coordinates of the face, are visible in the wide photograph."""
+        """Return a mask of the rays, in normalized coordinates of the face, that are visible in the wide photograph."""
         if self.model == "EQUIRECTANGULAR":
             return np.ones(u.shape, bool)
         (side_angles, fold_angle), (x, y, z) = self._angles, self._directions(u, v)

@@ -167,7 +167,7 @@ def _convert(source: str, fields: list[str], types: Sequence[Callable[[str], Any
 
 
 def _parse_id(text: str) -> int:
-    """Parse the ID of a point, clamped to the range that COLMAP uses; -1: no point."""
+    """Parse the ID of a point, clamped to the range that COLMAP uses.  -1 means no point."""
     return min(max(int(text), -1), LARGEST_ID)
 
 
@@ -209,7 +209,7 @@ class _Binary:
         return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout), label))
 
     def count(self, stride: int, label: str) -> int:
-        """Read the number of records, and check that the file has room for them, of at least `stride` bytes each."""
+        """Read the number of records, and check that the file can hold records of at least `stride` bytes."""
         (count,) = self.read("<Q", f"the number of {label}")
         self.offset = self.skip(count * stride, f"{count} {label}")
         return int(count)
@@ -375,7 +375,7 @@ def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
 
 
 def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
-    """Return which points each image shows, with reprojection residuals for `views`; None if no image lists points."""
+    """Return the points that each image shows, with residuals for `views`, or None if no image lists points."""
     is_finite = table.is_finite()
     positions, ids = table.positions[is_finite], table.ids[is_finite]
     order = np.argsort(ids, kind="stable")

@@ -149,12 +149,12 @@ SAMPLED_PHOTOGRAPHS = 3  # several training photographs, since the object may fi
 
 
 def is_transparent(scene: Scene) -> bool:
-    """Return whether a sampled training photograph has transparent pixels that are not masked.  Raises DataError."""
+    """Return whether any sampled training photograph has transparent pixels that are not masked.  Raises DataError."""
     return any(map(_is_transparent, sample_views(scene.split("train"), SAMPLED_PHOTOGRAPHS)))
 
 
 def has_visible_background(scene: Scene) -> bool:
-    """Return whether a sampled training photograph can be composited on another background.
+    """Return whether any sampled training photograph can be composited on another background.
 
     Photographs with masks cannot.  Raises DataError when a file cannot be read.
     """

@@ -267,7 +267,7 @@ def load_transparency(view: View) -> NDArray[np.uint8] | None:
 
 
 def load_mask(view: View) -> NDArray[np.bool_] | None:
-    """Return which pixels of `load_image` are valid, [H, W], or None when all are.
+    """Return a mask, [H, W], of the valid pixels of `load_image`, or None when all are valid.
 
     The entire area of a valid pixel is white in the mask file, opaque in the photograph (if alpha is a mask) and
     covered by the photograph (with a `whole` lens).  Raises DataError like load_image.

@@ -151,7 +151,7 @@ def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], r
 def _colors(
     silhouettes: Sequence[Silhouette], points: NDArray[np.float32], side: float
 ) -> tuple[NDArray[np.float32], Bools]:
-    """Return the mean colors of points in the views that show them, [M, 3] in [0, 1], and which are visible, [M]."""
+    """Return the mean colors of points in the views that show them, [M, 3] in [0, 1], and a visibility mask, [M]."""
     total, number = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
     for silhouette in silhouettes:
         projection, camera = silhouette.project(points), silhouette.view.camera

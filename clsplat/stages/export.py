@@ -101,7 +101,7 @@ def _name(file: Path, run: Run) -> str:
 class Cameras(Stage):
     """Write the cameras of the scene at full image size, so that other programs can show the model's views.
 
-    After a training with `camera_optimizer`, poses and focal lengths are the optimized ones."""
+    After training with `camera_optimizer`, these are the optimized poses and focal lengths."""
 
     stage: Literal["cameras"] = "cameras"
     output_keys: ClassVar[frozenset[str]] = frozenset({"formats", "folder"})

@@ -77,7 +77,7 @@ def estimate_motion(
 
 
 def with_motion(parameters: Parameters, motion: Motion | None, file: str) -> Parameters:
-    """Return the tables of a model file with the motion of the settings; a static model gets a motion of zero.
+    """Return the tables of a model file with the motion of the settings.  A static model gets a motion of zero.
 
     Raises ConfigError if the motion of the file differs from the settings.
     """

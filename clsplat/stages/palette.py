@@ -39,7 +39,7 @@ ROUNDS = 4  # iterations of Lloyd's algorithm; a fifth lowers the error of lego 
 
 
 class PaletteSh(Scheduled):
-    """Replace the harmonics of each Gaussian by a vector of a palette, as SOG stores them.
+    """Replace the harmonics of each Gaussian with a vector of a palette, as SOG stores them.
 
     Errors are weighted by their visibility in the training views: by the Gaussian's contribution, in the directions
     from which it is seen, and after the base color has been adapted to absorb part of them.  Training with a rate of 0
@@ -230,7 +230,7 @@ class VisibleError:
 
 
 def _append_products(vectors: Floats) -> NDArray[np.float32]:
-    """Return vectors, followed by the products of their coefficients that the form multiplies, summed over channels."""
+    """Append to vectors the products of their coefficients that the form multiplies, summed over channels."""
     table = vectors.reshape(len(vectors), -1, 3)
     i, j = np.triu_indices(table.shape[1])
     return np.concatenate([vectors, (table[:, i] * table[:, j]).sum(axis=2)], axis=1).astype(np.float32)
@@ -259,7 +259,7 @@ def set_clusters(gaussians: Gaussians, labels: NDArray[np.integer], weights: NDA
 
 
 def average_clusters(gaussians: Gaussians, name: str) -> None:
-    """Replace each row of a table by the weighted mean of its cluster's rows, summed in their order."""
+    """Replace each row of a table with the weighted mean of its cluster's rows, summed in their order."""
     labels = gaussians.get(LABEL)[:, 0].astype(np.int64)
     order, first = np.argsort(labels, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(labels))])
     gaussians.device.program("members.cl").share_mean(

@@ -27,7 +27,7 @@ class RaiseSh(Scheduled):
 
 
 class ResetOpacity(Scheduled):
-    """Lower all opacities; training raises those of needed Gaussians, and pruning removes floaters (Kerbl et al. 2023).
+    """Lower all opacities.  Training raises them where needed, and pruning removes floaters (Kerbl et al. 2023).
 
     `value` applies after the world filter (Yu et al. 2024).
     """

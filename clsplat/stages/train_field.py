@@ -27,9 +27,9 @@ LOG = logging.getLogger("clsplat")
 class TrainField(Training):
     """Train a field of densities and colors on random rays of the photos (Mip-NeRF, Barron et al. 2021).
 
-    A step samples its rays from one photo, or the same number from each of several.  With several image sizes, pixels
-    are weighted by their area, so that all sizes contribute equally (section 4).  Stages that render, measure and
-    report work with fields as with Gaussians; `export_field` writes a file.
+    A step samples its rays from one photo, or the same number of rays from each of several photos.  With several image
+    sizes, pixels are weighted by their area, so that all sizes contribute equally (section 4).  Stages that render,
+    measure and report support fields like Gaussians; `export_field` writes a file.
     """
 
     stage: Literal["train_field"] = "train_field"

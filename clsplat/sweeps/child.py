@@ -1,4 +1,4 @@
-"""Run an attempt in a child process that ends if its supervisor ends."""
+"""Run an attempt in a child process that exits if its supervisor exits."""
 
 import os
 import subprocess

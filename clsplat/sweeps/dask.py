@@ -244,7 +244,7 @@ class Cluster:
         return ticket
 
     def close(self) -> None:
-        """Let running cells save their state and end; then close the client and the local workers."""
+        """Let running cells save their state and stop; then close the client and the local workers."""
         if self._pending:
             self._store.stop(self._sweep)
         deadline = time.monotonic() + STOP_TIMEOUT_S
@@ -266,7 +266,7 @@ class Cluster:
 
 
 def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
-    """Test each device with a short run, and run cells of a scheduler until it ends or a signal arrives.
+    """Test each device with a short run, and run cells of a scheduler until it exits or a signal arrives.
 
     This is `clsplat worker`.  execution: has the address of the scheduler.  devices: names of devices; default: all
     working devices.  Raises DeviceError if there is no device, or if the scheduler does not respond.

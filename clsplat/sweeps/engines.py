@@ -19,7 +19,7 @@ class Ticket(Protocol):
     """A cell that is running on an engine."""
 
     def outcome(self) -> Outcome | None:
-        """Return how the cell ended, or None while it runs.  Raises CellLost if its process no longer exists."""
+        """Return the outcome of the cell, or None while it runs.  Raises CellLost if its process no longer exists."""
 
 
 class CellLost(Exception):

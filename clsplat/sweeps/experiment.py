@@ -117,7 +117,7 @@ class Job:
 
         out: the run folder; default: runs/NAME, with a number appended if that folder has another run.
         overrides: settings in the form 'stage.key=value'.
-        start: "resume" continues from the newest checkpoint; "restart" replaces the run in the folder by a new one.
+        start: "resume" continues from the newest checkpoint; "restart" replaces the run in the folder with a new one.
         execution: replaces the `execution` of a matrix.
         """
         state = None

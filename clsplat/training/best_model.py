@@ -36,7 +36,7 @@ class Scores(BaseModel):
         return f"At step {self.step:,} the model has {psnrs}{self.overfit_text()}."
 
     def overfit_text(self, first: "Scores | None" = None) -> str:
-        """Return a clause that says that the model overfits, else "".  first: scores of the first model that did."""
+        """Return a clause about overfitting, or "" without overfitting.  first: scores of the first overfit model."""
         since = f" since step {first.step:,}" if first and first.step < self.step else ""
         return f", more than {OVERFIT_GAP:g} dB apart{since}: the model overfits" if self.is_overfit else ""
 

@@ -310,7 +310,7 @@ def save_failed(run: Run, broken: list[str]) -> str:
 
 
 def list_files(out: Path) -> list[Path]:
-    """Return the checkpoints of a run folder from old to new; those of a refit come last."""
+    """Return the checkpoints of a run folder from old to new.  Checkpoints of a refit come last."""
     by_rank = {
         (match[1] == "refit", int(match[2])): path
         for path in (out / CHECKPOINTS).glob("*.npz")
@@ -390,7 +390,7 @@ def rename_damaged(out: Path, restored: Path | None) -> None:
 
 
 def _remove(files: Iterable[Path]) -> None:
-    """Remove older states; on Windows, a file that another program is reading stays until the next call."""
+    """Remove older states.  On Windows, a file that another program is reading remains until the next call."""
     for file in files:
         try:
             file.unlink(missing_ok=True)

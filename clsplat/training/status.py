@@ -204,7 +204,7 @@ class StatusFile:
         self.note(progress=Amount(done=done, total=total, unit=unit), **values)
 
     def counted(self, items: Iterable[Item], unit: str, total: int) -> Iterator[Item]:
-        """Yield the items and report the progress; an item is done when the next one is requested."""
+        """Yield the items and report the progress.  An item is done when the next one is requested."""
         for number, item in enumerate(items):
             self.count(unit, number, total)
             yield item

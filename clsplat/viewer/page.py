@@ -98,7 +98,7 @@ class Page:
 
     @property
     def _timestamps(self) -> list[float]:
-        """The timestamps of the views, in order, or evenly spaced ones if there are fewer than two."""
+        """The timestamps of the views, in order, or evenly spaced timestamps if there are fewer than two."""
         times = np.unique([view["time"] for view in self.views if "time" in view])
         return [float(time) for time in (times if len(times) > 1 else np.linspace(0, 1, TIMESTAMPS))]
 

@@ -208,7 +208,7 @@ def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray
 
 
 def shared_means(values: NDArray[Any], labels: NDArray[Any], weights: NDArray[Any]) -> NDArray[Any]:
-    """Replace each row by the weighted mean of the rows with its label; return [N,c].
+    """Replace each row with the weighted mean of the rows with its label; return [N,c].
 
     values: [N,c]; labels, weights: [N].  If all weights of a label are zero, its first row is used instead.
     """

@@ -127,8 +127,8 @@ def _brightness_steps(
 ) -> list[tuple[str, str, float]]:
     """Return adjacent photographs whose mean and median brightness both differ by a factor above MAX_BRIGHTNESS_RATIO.
 
-    Only one of the two may differ if the content differs.  exposed_names: photographs with known exposures; pairs of
-    them are skipped.
+    If only the content differs, often only the mean or the median differs.  exposed_names: photographs with known
+    exposures; pairs of them are skipped.
     """
     steps = []
     for (name, x), (next_name, y) in pairwise(brightness.items()):

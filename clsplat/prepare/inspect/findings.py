@@ -45,7 +45,7 @@ class Finding:
 
 
 def check_photo_folder(facts: Facts) -> Iterator[Finding]:
-    """Yield findings about a folder of photographs without cameras, and about files in it that are left out."""
+    """Yield findings about a folder of photographs without cameras, and about omitted files in the folder."""
     count, read_errors = facts.on_disk, facts.comparison.unreadable
     if facts.kind != "none" or facts.faults or not (count or facts.left_out):
         return

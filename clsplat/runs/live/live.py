@@ -155,7 +155,7 @@ class Live:
             self.state.error = str(error)
 
     def _pause(self, run: Run, preview: Preview) -> None:
-        """Wait until the page resumes the training, no page is open any more, or the run is interrupted."""
+        """Wait until the page resumes the training, the last page is closed, or the run is interrupted."""
         state = self.state
         LOG.info("paused at step %d from the live page", run.step)
         with run.status.stage("paused"):

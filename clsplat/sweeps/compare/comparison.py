@@ -202,7 +202,7 @@ def _settings(run: RunFolder) -> dict[str, str]:
 def _is_below(key_path: str, key: str) -> bool:
     """Return whether a flat key path is equal to, or below, a key in the notation of `--set`.
 
-    `--set` numbers the stages, and flat paths name them: `optimize.during.0.per_pixel` is equal to
+    `--set` numbers the stages, and flat paths contain their names: `optimize.during.0.per_pixel` is equal to
     `optimize.densify.per_pixel`.
     """
     names = iter(key_path.split("."))

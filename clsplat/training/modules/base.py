@@ -43,7 +43,7 @@ class TrainingStep:
     frame: Frame = field(init=False)
     planes: Planes = field(init=False)  # the photograph and its mask
     image: Array = field(init=False)  # image that the losses compare with the photograph; a module may replace it
-    gradient: Array = field(init=False)  # of the image; each `backward` replaces it by the gradient of its input
+    gradient: Array = field(init=False)  # of the image; each `backward` replaces it with the gradient of its input
     comparison: Comparison = field(init=False)
     transmittance_gradient: Array | None = None  # T dL/dT, [1, rows, stride]
     losses: list[LossValue] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Represent objects that only one photograph shows, such as people and cars, by Gaussians in front of its camera.
+"""Represent objects that only one photograph shows, such as people and cars, with Gaussians in front of its camera.
 
 These Gaussians are not rows of the model, so growth, metrics, and files ignore them.  Their unit of length is their
 initial depth, so that rates do not depend on the scene.

@@ -205,7 +205,7 @@ def render_video(
 
 
 def resize_view(view: View, size: Size | None = None) -> View:
-    """Return a view at another image size; by default, its own is rounded down to even sides."""
+    """Return a view at another image size.  By default, its size is rounded down to even sides."""
     target = size or even_size(view.camera)
     if target == (view.camera.width, view.camera.height):
         return view
