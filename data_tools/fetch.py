@@ -68,7 +68,7 @@ def fetch_package(name: str, version: str, sha256: str, folder: Path) -> Path:
 def find_source(name: str) -> WebArchive:
     """Return the dataset with this name.  Raises ConfigError if the name is unknown."""
     if name not in SOURCES:
-        raise ConfigError(f"no data set is called '{name}'; use one of {', '.join(SOURCES)}, or give --url")
+        raise ConfigError(f"no dataset is called '{name}'; use one of {', '.join(SOURCES)}, or give --url")
     return SOURCES[name]
 
 

@@ -109,7 +109,7 @@ def fetch(
     out: Annotated[Path, typer.Argument(help="Folder to write.")],
     sha256: Annotated[str, typer.Option(help="Expected checksum of an archive downloaded by address.")] = "",
 ) -> None:
-    """Download a public data set, or continue an interrupted download."""
+    """Download a public dataset, or continue an interrupted download."""
     from clsplat.data_tools.fetch import WebArchive, find_source
     from clsplat.data_tools.fetch import fetch as download
 

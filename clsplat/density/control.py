@@ -67,7 +67,7 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
 
 
 def _set_children(edit: Edit, row_offset: Array) -> None:
-    """Write the values that rules set for children, except where their number was changed by a later rule or limit."""
+    """Write the values that rules set for children, unless a later rule or limit changed the number of children."""
     copies, first_rows = edit.rows(), row_offset.get()
     for name, sources, values in edit.children:
         is_complete = copies[sources] == values.shape[1]

@@ -76,7 +76,7 @@ class Gltf:
         self.is_mip = False
         if unknown := [name for name in tree.get("extensionsRequired", []) if not SUPPORTED.fullmatch(name)]:
             names = first_few(list(map(quote, unknown)))
-            raise DataError(f"{path}: requires {names}, which clsplat cannot read; export it without")
+            raise DataError(f"{path}: requires {names}, which clsplat cannot read; export it without that")
         pairs = [(part, matrix) for mesh, matrix in self._meshes() for part in tree["meshes"][mesh]["primitives"]]
         self.primitives = [pair for pair in pairs if _has_gaussians(_extensions(pair[0]))]
         if not self.primitives:

@@ -39,7 +39,7 @@ def edge_scores(survey: Survey, views: int) -> Floats:
 
 
 class SplitLongAxis(Rule):
-    """Replace a Gaussian by two along its longest axis.
+    """Replace a Gaussian with two Gaussians along its longest axis.
 
     If the edit has a limit (`max_gaussians`, `budget`, memory), Gaussians are sampled by their edge-aware score.
     """

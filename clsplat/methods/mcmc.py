@@ -55,7 +55,7 @@ class Relocate(Rule):
 
 
 def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:
-    """Return how often systematic sampling draws each item, [N]: its expected number, rounded down or up.
+    """Return the number of times that systematic sampling draws each item, [N]: the expected number rounded down or up.
 
     It places `draws` equidistant points, shifted by one random number, on the cumulative weights, in exact integers.
     """

@@ -1,4 +1,4 @@
-"""Let Gaussians compete for opacity until a given number is left (natural selection, GNS, Deng et al. 2025)."""
+"""Let Gaussians compete for opacity until a given number remains (natural selection, GNS, Deng et al. 2025)."""
 
 from typing import Annotated, Literal
 

@@ -113,7 +113,7 @@ class DenseLayer:
 
 
 class FieldShape(Settings):
-    """The field of Mip-NeRF (Barron et al. 2021): both levels share one network of positions and directions."""
+    """The shape of a Mip-NeRF field (Barron et al. 2021), whose levels share a network of positions and directions."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"unit_auto"})
 

@@ -194,7 +194,7 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
 def change_background(
     workspace: Workspace, camera: DeviceCamera, colors: Array, transparency: Array, background: Array, behind: Array
 ) -> None:
-    """Replace the color `background` by `behind`, both [3], in the planes `colors`, [3, rows, stride].
+    """Replace the color `background` with `behind`, both [3], in the planes `colors`, [3, rows, stride].
 
     transparency: [1, height, width] uint8, 255 where only the background is visible.
     """

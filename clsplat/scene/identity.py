@@ -89,8 +89,8 @@ def require_content(path: Path, views: Sequence[View], files: Mapping[Path, Imag
     if masked:
         examples = first_few([f"{view.name} ({view.mask_path or view.image_path})" for view in masked])
         raise DataError(
-            f"{path}: masks exclude every pixel of {pluralize(len(masked), 'photo')}: {examples}; masks are white "
-            "(255) in pixels to use: correct them, or remove these photos"
+            f"{path}: masks exclude every pixel of {pluralize(len(masked), 'photo')}: {examples}; masks must be "
+            "white (255) in usable pixels: correct them, or remove these photos"
         )
     blank = [view.name for view in views if view.image_path in files and files[view.image_path].blank]
     if blank and len(blank) == len(views):

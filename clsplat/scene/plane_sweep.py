@@ -166,7 +166,7 @@ def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Indices, In
 def _confirm(
     i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], neighbors: Sequence[int], inverse: Floats
 ) -> NDArray[np.bool_]:
-    """Return which pixels, [H, W], have a depth that enough adjacent views confirm, not on an outer plane."""
+    """Return a mask, [H, W], of the pixels whose depth enough adjacent views confirm and is not on an outer plane."""
     shape = planes[i].shape
     rows, columns = (index.ravel() for index in np.indices(shape))
     points = _unproject(views[i], rows, columns, 1 / inverse[planes[i].ravel()])

@@ -29,7 +29,7 @@ def _require_text(value: Any) -> Any:
     if not isinstance(value, str):
         raise ValueError("expected names of photos as text: put numbers in quotes, as in '0042'")
     if not value.strip():
-        raise ValueError("expected names of photos that are not empty")
+        raise ValueError("expected names of photos, none of them empty")
     return value
 
 
@@ -56,7 +56,7 @@ class ViewSelection(Settings):
     @model_validator(mode="before")
     @classmethod
     def _check_notation(cls, value: Any) -> Any:
-        """Explain common mistakes."""
+        """Return the value unchanged.  Raises ValueError with an explanation for common mistakes of notation."""
         if not isinstance(value, dict):
             return value
         if any(isinstance(key, str) and ":" in key and content is None for key, content in value.items()):

@@ -187,7 +187,7 @@ class Init(Stage):
         return self.transparent if is_transparent(scene) else "sweep"
 
     def _parameters(self, run: Run, degree: int) -> tuple[Parameters, str]:
-        """Return the parameters and their source, which is "random" if another source gives too few points."""
+        """Return the parameters and their source, which is "random" if another source has too few points."""
         source = self._source(run.scene)
         if source == "model":
             parameters = with_degree(self._read(run.scene), degree)

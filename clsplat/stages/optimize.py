@@ -339,7 +339,7 @@ class Optimize(ValidatedTraining):
 
     @property
     def statistics(self) -> set[str]:
-        """Columns of statistics that density rules read."""
+        """The columns of statistics that density rules read."""
         return {name for stage in self._density for name in stage.statistics}
 
     @property

@@ -119,7 +119,7 @@ class TrainField(Training):
         return field
 
     def _step(self, run: Run, field: LearnedField, pool: ViewPool) -> None:
-        """Train for one step; a failure before its update leaves the run at the previous step."""
+        """Train for one step.  A failure before its update leaves the run at the previous step."""
         step = run.step + 1
         run.device.timings.sampling = step % self.log_every == self.log_every // 2
         photographs = list(self._sample(run, pool, step))
@@ -144,7 +144,7 @@ class TrainField(Training):
     def _values(self, run: Run, field: LearnedField) -> tuple[float, float]:
         """Return the loss of the last step, and the PSNR of its fine level, dB.
 
-        Raises NotFiniteError, after setting the state aside, if the loss or the field is not finite.
+        Raises NotFiniteError, after saving the state separately, if the loss or the field is not finite.
         """
         loss, error = field.loss(self.coarse_weight)
         damaged_tables = field.not_finite()

@@ -247,7 +247,7 @@ def run_one(
     device: str | None = None,
     retries: int = 3,
 ) -> Path:
-    """Run a cell of a matrix, or a pipeline as a cell, unless its result is in the store; return the result's folder.
+    """Run a cell of a matrix, or a pipeline as a cell, unless the store has its result; return the result's folder.
 
     root: the folder of the store.  index: index of the cell in the matrix, from 0.  Raises ClsplatError with the exit
     code of the run.

@@ -153,7 +153,7 @@ class Run:
         self.use_split(self.original.merge_validation())
 
     def use_split(self, original: Scene) -> None:
-        """Replace the original scene by one with a different split of its views."""
+        """Replace the original scene with one that has a different split of its views."""
         self.original, self.scene = original, original.downscaled(*self.scene.downscales)
         self._filter_views, self._texture_quantiles = None, {}
 

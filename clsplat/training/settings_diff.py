@@ -36,7 +36,7 @@ class Difference(NamedTuple):
 def differences(
     old: Any, new: Any, settings: Any = None, key_path: str = "", kind: Kind = None
 ) -> Iterator[Difference]:
-    """Yield the differences of two resolved pipelines, in order.
+    """Yield the differences between two resolved pipelines, in order.
 
     settings: the settings that `new` was resolved from; their classes define the kinds.
     """

@@ -138,7 +138,7 @@ class Scheduled(Stage):
 def find_output_conflict(stages: Sequence[Stage]) -> str | None:
     """Return a path that two stages would write, at least one of them as a file, or None.
 
-    Stages may share a folder.  Names are compared without case, since some file systems ignore it.
+    Stages may share a folder.  Names are compared ignoring case, as some file systems do.
     """
     earlier_paths: list[tuple[tuple[str, ...], bool]] = []  # components of each path, and whether it is a file
     for stage in stages:

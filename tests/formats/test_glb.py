@@ -182,7 +182,7 @@ REFUSED = {
     "kernel": (change(["meshes", 0, "primitives", 0, "extensions", KHR, "kernel"], "box"), "kernel is 'box'"),
     "required extension": (
         change(["extensionsRequired"], [KHR, "KHR_materials_unlit", "EXT_mesh_gpu_instancing"]),
-        "requires 'EXT_mesh_gpu_instancing', which clsplat cannot read; export it without",
+        "requires 'EXT_mesh_gpu_instancing', which clsplat cannot read; export it without that",
     ),
     "web": (
         change(["buffers", 0, "uri"], "https://a.org/a.bin"),

@@ -234,7 +234,7 @@ def test_dataset_without_images_is_refused(folder):
         ("holdout={offset: 4}", "'offset' needs 'every', as in {every: 8, offset: 4}"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
         ("holdout={names: [42]}", "expected names of photos as text: put numbers in quotes, as in '0042'"),
-        ("holdout={names: [a, '']}", "expected names of photos that are not empty"),
+        ("holdout={names: [a, '']}", "expected names of photos, none of them empty"),
         ("train={names: [1.5]}", "put numbers in quotes, as in '0042', got 1.5"),
         ("validation=best", "or auto, got 'best'"),
         ("missing=ignore", "'refuse' or 'skip'"),

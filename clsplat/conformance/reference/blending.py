@@ -249,7 +249,7 @@ class Margin(NamedTuple):
 
 
 def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Margin:
-    """Return the distances of blending from its thresholds, with which tests find scenes that float32 blends alike."""
+    """Return the distances of blending from its thresholds, so tests can find scenes that float32 blends alike."""
     alpha, transmittance, cap = [np.inf], [np.inf], [np.inf]
     for step in blend_steps(splats, width, height, thresholds):
         uncapped = splats.opacity[step.splat] * step.falloff

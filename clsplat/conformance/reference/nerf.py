@@ -107,7 +107,7 @@ PIXELS, COARSE, FINE = 8, 9, 10  # kinds of random numbers, see cl_kernels/rays.
 
 
 def draw_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDArray[np.int64]:
-    """Return a pixel out of `count` for each ray of a step, starting at ray `first`, [rays]."""
+    """Draw the index of a pixel, below `count`, for each ray of a step, [rays].  first: the index of the first ray."""
     return np.array([philox((first + i, step, PIXELS, 0), (seed, 0))[0] * count >> 32 for i in range(rays)], np.int64)
 
 

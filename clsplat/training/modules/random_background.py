@@ -16,7 +16,7 @@ LOG = logging.getLogger("clsplat")
 
 
 class RandomBackground(TrainingModule):
-    """Draw a uniform random background color in each step; it depends only on the seed and the step."""
+    """Draw a uniform random background color in each step.  It depends only on the seed and the step."""
 
     conflicts: ClassVar[Mapping[str, str]] = {"sky": "both are the background"}
     optional_on_resume: ClassVar[bool] = True
