@@ -78,7 +78,7 @@ def _camera_names(path: Path) -> set[str]:
 
 
 def _frames(path: Path) -> dict[str, list[Path]]:
-    """Return the sorted frames of each camera.  Raises DataError unless all cameras have as many frames, at least 2."""
+    """Return the sorted frames of each camera.  Raises DataError unless all have the same number, at least 2."""
     folders = _entries(path)
     frames = {
         entry.name: sorted(filter(is_image, entry.iterdir()), key=_natural_order) for entry in folders if entry.is_dir()
