@@ -10,7 +10,6 @@ from pydantic import Field
 from clsplat.core.errors import pluralize
 from clsplat.core.settings import Settings
 from clsplat.scene.quality import Measures, is_transparent
-from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
 
 
@@ -56,17 +55,15 @@ class Adaptation(Settings):
         return [decision.key for decision in self.decide(training, Measures(0))]
 
 
-FEW = 40  # training photos; with fewer, a model overfits
+FEW = 40  # training photos; the hull of fewer silhouettes is too large
 MIN_FOR_SKY = 12  # training photos; fewer show too little of the background
-MAX_PER_PIXEL = ((0.5, 0.1), (0.25, 0.3), (0.0, 0.6))  # minimum fraction of photos with sky, Gaussians per pixel
 MAX_ERROR = 1.0  # px, mean reprojection error at the training size; poses are optimized if it is this large
-STEPS = 3400  # training steps of the pipeline `photos`, to which the steps below refer
-DROPOUT_UNTIL, POSES_START = 1460, 500
+POSES_START = 0.15  # fraction of the training steps after which poses are optimized
 
 
 class Photos(Adaptation):
-    """Decide settings for folders of photos.  With fewer than 40: dropout, fewer Gaussians, perhaps a sky.  With a
-    reprojection error of a pixel or more: optimized poses."""
+    """Decide settings for folders of photos: a sky if they show one, optimized poses if the reprojection error is a
+    pixel or more, and a random start for fewer than 40 photos with transparency."""
 
     type: Literal["photos"] = "photos"
 
@@ -86,38 +83,21 @@ class Photos(Adaptation):
         )
         yield Decision(key="init.count", value=100_000 if few else 60_000, reason=reason, matters=False)
 
-        dropout = {"probability": [[0, 0.0], [DROPOUT_UNTIL * training.steps // STEPS, 0.2]]} if few else None
-        reason = f"{count}: {'dropout against overfitting' if few else 'enough to train without dropout'}"
-        yield Decision(key="optimize.modules.dropout", value=dropout, reason=reason, matters=few)
         random = {"when": "transparent"} if few else None
         reason = f"{count}: {'random' if few else 'no random'} colors behind transparent pixels"
         yield Decision(key="optimize.modules.random_background", value=random, reason=reason, matters=few and has_alpha)
 
-        densify = next((i for i, stage in enumerate(training.during) if isinstance(stage, Densify)), 0)
-        per_pixel, reason = _max_per_pixel(measures) if few else (None, ": enough for as many Gaussians as grow")
-        yield Decision(
-            key=f"optimize.during.{densify}.per_pixel", value=per_pixel, reason=f"{count}{reason}", matters=few
-        )
-
         # The modules log what they choose for the sky and for exposures.
-        sky = {"type": "auto", "photographs": 0.25} if MIN_FOR_SKY <= measures.photographs < FEW else None
-        reason = "a sky, if they show one" if sky else "too few for a sky" if few else "enough to do without a sky"
+        sky = {"type": "auto", "photographs": 0.25} if measures.photographs >= MIN_FOR_SKY else None
+        reason = "a sky, if they show one" if sky else "too few for a sky"
         yield Decision(key="model.background", value=sky, reason=f"{count}: {reason}", matters=False)
 
         error = measures.reprojection_error
         is_large = error is not None and error >= MAX_ERROR
         fit = "the reprojection error is unknown" if error is None else f"cameras fit the points to {error:,.4g} px"
-        poses = {"start": POSES_START * training.steps // STEPS} if is_large else None
+        poses = {"start": round(POSES_START * training.steps)} if is_large else None
         reason = f"{fit}: poses {'are optimized' if is_large else 'stay as they are'}"
         yield Decision(key="optimize.modules.camera_optimizer", value=poses, reason=reason, matters=error is not None)
         exposure = {"when": "auto"} if is_large else {"when": "auto", "min_spread": 0.2}
         reason = f"{fit}: {'small' if is_large else 'only large'} differences of exposure are corrected"
         yield Decision(key="optimize.modules.exposure", value=exposure, reason=reason, matters=False)
-
-
-def _max_per_pixel(measures: Measures) -> tuple[float, str]:
-    """Return the number of Gaussians per pixel that a small set of photos can constrain, and the reason as text."""
-    sky = measures.sky
-    count = next(count for fraction, count in MAX_PER_PIXEL if (sky or 0.0) >= fraction)
-    sky_text = "" if sky is None else f", {sky:.0%} of them with sky"
-    return count, f"{sky_text}: at most {count:g} Gaussians per pixel"

@@ -45,6 +45,7 @@ class FeatureOptions:
     long_side: int = 1600  # px; larger images are reduced
     count: int = 12288  # maximum number of features per image
     contrast: float = 0.02  # threshold, as a fraction of the gray range; the default of COLMAP, and 0.04 in Lowe 2004
+    min_side: int = 0  # px; images whose long side is shorter are enlarged to twice their size
 
 
 def find_features(
@@ -120,11 +121,15 @@ def sift(pixels: NDArray[np.uint8], options: FeatureOptions) -> tuple[NDArray[np
         sigma=BLUR,
         enable_precise_upscale=True,
     )
-    points, raw_descriptors = detector.detectAndCompute(pixels, None)
+    factor = 2 if max(pixels.shape) < options.min_side else 1
+    enlarged = cv2.resize(pixels, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    points, raw_descriptors = detector.detectAndCompute(enlarged, None)
     if not points:
         return np.empty((0, 4), np.float32), np.empty((0, 128), np.uint8)
     best = np.argsort([-point.response for point in points], kind="stable")[: options.count]
-    keypoints = [(p.pt[0] + 0.5, p.pt[1] + 0.5, p.size / 2, np.deg2rad(p.angle)) for p in points]
+    keypoints = [
+        ((p.pt[0] + 0.5) / factor, (p.pt[1] + 0.5) / factor, p.size / 2 / factor, np.deg2rad(p.angle)) for p in points
+    ]
     fractions = raw_descriptors / np.maximum(raw_descriptors.sum(axis=1, keepdims=True), 1.0e-6)
     descriptors = np.clip(np.rint(LEVELS * np.sqrt(fractions)), 0, 255).astype(np.uint8)
     return np.array(keypoints, np.float32)[best], descriptors[best]

@@ -35,7 +35,7 @@ LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
 ENOUGH = 0.9  # fraction of placed photographs from which no attempt with denser features follows
 DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
-DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01)
+DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01, min_side=1200)
 FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap raises the middle two
 PAIR = 2  # track length of points that COLMAP drops from its models
 PAIR_ERROR = 1.0  # px, mean reprojection error; strict, since the two rays of any pair of features nearly meet

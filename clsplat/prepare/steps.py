@@ -136,7 +136,7 @@ class MapCameras(Step):
     `match_features` matched all of them, and with more features.
     """
 
-    version: ClassVar[int] = 2  # matches more pairs of unplaced photographs
+    version: ClassVar[int] = 3  # enlarges small photos for denser features
     resumes: ClassVar[bool] = True
     seconds: ClassVar[tuple[float, float]] = 0.1, 4.0  # more for further attempts
 

@@ -33,7 +33,7 @@ from clsplat.scene.view import View
 from clsplat.scene.view_selection import MissingViewError
 from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
-from clsplat.training.modules.sky_choice import choose_sky, sky_fraction
+from clsplat.training.modules.sky_choice import choose_sky
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
 
@@ -256,7 +256,7 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
     """
     with run.status.stage("choose"):
         if pipeline.undecided:
-            pipeline = apply_adaptation(pipeline, measure_scene(run.scene, lambda: sky_fraction(run)))
+            pipeline = apply_adaptation(pipeline, measure_scene(run.scene))
             for reason in pipeline.reasons if log_reasons else ():
                 LOG.info("%s", reason)
         pipeline = _with_modules(with_lengths(pipeline, run.scene), run)

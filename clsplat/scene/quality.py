@@ -1,8 +1,6 @@
 """Measure the photographs before training, so that settings can be adapted to them."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -30,19 +28,13 @@ class Measures:
     """Mean reprojection error of the points, px at the training resolution; None: unknown."""
     scene: Scene | None = None
     """The scene at the training resolution; None: not prepared yet."""
-    measure_sky: Callable[[], float | None] = lambda: None
-
-    @cached_property
-    def sky(self) -> float | None:
-        """The fraction of training photographs that show the sky, or None if unknown.  The first access reads all."""
-        return self.measure_sky()
 
 
-def measure_scene(scene: Scene, measure_sky: Callable[[], float | None] = lambda: None) -> Measures:
+def measure_scene(scene: Scene) -> Measures:
     """Return the measurements of a scene at the training resolution."""
     views = {view.name: view for view in reversed(scene.merge_validation().split("train"))}  # the largest size of each
     errors = reprojection_errors(scene.tracks, views.values())
-    return Measures(len(views), None if errors is None else float(errors.mean()), scene, measure_sky)
+    return Measures(len(views), None if errors is None else float(errors.mean()), scene)
 
 
 def near_depth(scene: Scene) -> float | None:

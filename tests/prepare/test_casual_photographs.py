@@ -133,13 +133,14 @@ def test_downscaled_photographs_report_their_scale(tmp_path):
         np.testing.assert_allclose([(x + 0.5) * across, (y + 0.5) * down], [1000.5, 700.5], atol=0.3)
 
 
-def test_features_are_at_the_spots():
+@pytest.mark.parametrize("min_side", [0, 200])
+def test_features_are_at_the_spots(min_side):
     pixels = np.full((120, 160), 90, np.float32)
     y, x = np.indices(pixels.shape) + 0.5
     spots = [(40.0, 30.0), (110.25, 70.75), (60.5, 95.0)]
     for at in spots:
         pixels += 120 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 3.0**2))
-    keypoints, descriptors = sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=50))
+    keypoints, descriptors = sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=50, min_side=min_side))
     for at in spots:
         assert np.linalg.norm(keypoints[:, :2] - at, axis=1).min() < 0.1
     assert descriptors.dtype == np.uint8

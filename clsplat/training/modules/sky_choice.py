@@ -22,15 +22,6 @@ from clsplat.training.run import Run
 LOG = logging.getLogger("clsplat")
 
 
-def sky_fraction(run: Run) -> float | None:
-    """Return the fraction of training and validation photographs that show a sky; None if the fraction is unknown."""
-    if _explain_unknown(run):
-        return None
-    background = run.model_settings.background
-    sky_count, count = _count_skies(run, (background if isinstance(background, Auto) else Auto()).share)
-    return sky_count / count
-
-
 def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
     """Return model settings in which `background: auto` is resolved, without a sky if a module conflicts with it.
 
