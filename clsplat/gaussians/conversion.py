@@ -1,4 +1,4 @@
-"""Convert model files to another format: merge, transform, crop, and reduce them."""
+"""Convert model files to other formats, and merge, transform, crop, and reduce them on the way."""
 
 import logging
 import math
@@ -45,7 +45,7 @@ SHARED = ("near", "screen_variance", "background", "alpha")  # rendering paramet
 def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     """Merge all Gaussians into one model, with the first model's rendering parameters and the largest SH degree.
 
-    World filters are baked unless all models have one.  If some models move, the others get a static motion.
+    World filters are baked unless all models have one.  If some models move, the others get a constant motion.
     Raises DataError if the models use different screen filters or incompatible motions.
     """
     first = models[0]
@@ -113,7 +113,7 @@ class Changes:
 
 
 def writing_options(out: Path, quality: Quality, changes: Changes) -> Writing:
-    """Return the options for writing a file.  Raises ConfigError for a quality that is unknown or has no effect."""
+    """Return the options for writing a file.  Raises ConfigError if the quality is unknown or has no effect."""
     if quality not in QUALITIES:
         raise ConfigError(f"--quality {quote(quality)}: expected one of {', '.join(QUALITIES)}")
     if quality != "balanced" and not writing_format(out).has_quality:
@@ -143,7 +143,7 @@ def read(sources: Sequence[Path]) -> Model:
 
 
 def write_model(sources: Sequence[Path], model: Model, out: Path, options: Writing) -> dict[str, Any]:
-    """Write a model that was read from `sources`, and return the same as `convert`.  Raises OutputError."""
+    """Write a model that was read from `sources`, and return the same dictionary as `convert`.  Raises OutputError."""
     size = sum(model_bytes(model_path(source)) for source in sources)
     model.save(out, options)
     kind = writing_format(out).name
@@ -160,7 +160,7 @@ def check_output(sources: Sequence[Path], out: Path) -> None:
 def parse_transform(text: str) -> NDArray[np.float64]:
     """Parse a transform such as `scale=2 rotate=90,0,0 translate=0,1,0`, applied from left to right; return [4, 4].
 
-    Rotations are in degrees about x, then y, then z.  12 or 16 comma-separated numbers are a matrix, row by row.
+    Rotations are in degrees about x, then y, then z.  A row-major matrix is given as 12 or 16 comma-separated numbers.
     Raises ConfigError.
     """
     expected = (
@@ -231,7 +231,10 @@ def check_degree(degree: int | None) -> int | None:
 
 
 def _extract_frame(model: Model, time: float) -> Model:
-    """Return a moving model at one time.  Raises ConfigError for a static model, DataError if nothing is visible."""
+    """Return a moving model at one time, as a static model.
+
+    Raises ConfigError if the model does not move, and DataError if nothing is visible.
+    """
     if model.motion is None:
         raise ConfigError("the model does not move; omit --time and --frames")
     frame = model.at(time)
@@ -336,7 +339,7 @@ def _link_or_copy(file: Path, target: Path) -> None:
 
 
 def _require_no_other_frames(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
-    """Raise ConfigError if a folder has frames of another series, because players would also show those.
+    """Raise ConfigError if a folder has frames of another series, because players would show those frames, too.
 
     names: the pattern of the frames' names.
     """

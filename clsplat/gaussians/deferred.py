@@ -1,6 +1,6 @@
 """Defer Adam updates of the SH bands above 0 until a view sees their Gaussians.
 
-The update of a value with zero gradient only depends on the value, its moments, and the factors of the step.  The
+The update of a value with zero gradient depends only on the value, its moments, and the factors of the step.  The
 updates of a block of rows that no view sees are therefore recorded, and applied in order when a view sees the block.
 The results are bit-identical to those of immediate updates.  This covers 81 % of the values of a Gaussian of SH degree
 3.  Means, scales, quaternions, and opacities are not deferred, because they determine which Gaussians are visible, and
@@ -29,7 +29,7 @@ class Deferred:
     names: ClassVar[tuple[str, ...]] = HARMONICS
 
     def __init__(self, gaussians: Gaussians, max_updates: int = MAX_UPDATES) -> None:
-        """max_updates: the number of recorded updates at which all are applied; results do not depend on it."""
+        """max_updates: number of recorded updates after which all are applied.  It does not affect the results."""
         device = gaussians.device
         self.gaussians, self.max_updates = gaussians, max_updates
         self.updates = 0  # recorded since the last flush
@@ -44,7 +44,7 @@ class Deferred:
         return self.gaussians.capacity // self._lanes
 
     def array(self, name: str) -> Array:
-        """Return one of `names`, [components, S], without applying deferred updates."""
+        """Return a table from `names`, [components, S], without applying deferred updates."""
         return self.gaussians.tables[name].array
 
     def catch_up(self, depth_key: Array) -> None:

@@ -1,4 +1,4 @@
-"""Store Gaussians on the device as a struct of arrays, with the one operation that changes their number.
+"""Store Gaussians on the device as a struct of arrays, with a single operation that changes their number.
 
 Each table is [components, capacity] on the device and [N, components] on the host.  Parameters, Adam's moments, and
 statistics are all tables, so that their rows always move together.
@@ -73,7 +73,7 @@ GROWTH = 1.125  # factor on the capacity; small, since every edit copies all tab
 
 @dataclass
 class Table:
-    """One quantity of every Gaussian, [components, capacity]."""
+    """An array of one quantity for all Gaussians, [components, capacity]."""
 
     array: Array
     components: int
@@ -81,10 +81,10 @@ class Table:
 
 
 class Gaussians:
-    """N Gaussians and their tables."""
+    """The tables of N Gaussians on a device."""
 
     def __init__(self, device: Device, parameters: Mapping[str, NDArray[np.float32]]) -> None:
-        """Upload `parameters`, [N, components] by name: all of PARAMETERS; optional: filter_variance and motion."""
+        """Upload `parameters`, [N, components] by name: all PARAMETERS, and optionally filter_variance and motion."""
         self.device = device
         self.count = len(parameters["means"])
         self.capacity = _align(self.count)
@@ -109,7 +109,7 @@ class Gaussians:
         return self._up_to_date(name).array
 
     def _up_to_date(self, name: str) -> Table:
-        """Return a table after applying its deferred updates."""
+        """Apply the deferred updates of a table, and return it."""
         if self.deferred and name in self.deferred.names:
             self.deferred.flush()
         return self.tables[name]
@@ -272,7 +272,7 @@ class DeviceModel:
 
     @property
     def defines(self) -> dict[str, int]:
-        """The macros of the kernels that project, list, and blend these splats."""
+        """The macros for kernels that project, list, and blend these splats."""
         return ({"PIXEL_BOX": 1} if self.pixel_box else {}) | slot_defines(self.gaussians)
 
 

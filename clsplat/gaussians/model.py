@@ -1,4 +1,4 @@
-"""Define a model on the host: NumPy arrays in the units of model files, and rendering parameters."""
+"""Define a model on the host: its NumPy arrays, in the units of model files, and its rendering parameters."""
 
 import logging
 from collections.abc import Mapping
@@ -72,7 +72,7 @@ class Rendering:
         )
 
     def comment(self) -> dict[str, Any]:
-        """Return the values for a model file's comment."""
+        """Return the rendering parameters as the dictionary in a model file's comment."""
         values = {"screen_variance": self.screen_variance, "compensate": self.compensate}
         values = {"near": self.near, **values} if self.near else values
         optional: dict[str, Any] = {"background": self.background} if self.background else {}
@@ -374,7 +374,7 @@ def is_float32_precise(means: NDArray[np.floating], log_scales: Floats) -> bool:
 def load(path: str | Path, options: Reading | None = None) -> Model:
     """Read a model file of any format (docs/formats.md), or the model of a run folder.
 
-    If the file has no origin and float32 is too coarse for its means, an origin near them is chosen.
+    If the file has no origin and float32 is not precise enough for its means, an origin near them is chosen.
     Raises DataError if the file is missing, damaged, or not a splat model.
     """
     path = Path(path)

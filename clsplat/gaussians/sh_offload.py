@@ -23,7 +23,7 @@ class HostTables:
     """Tables of Gaussians in host memory, each [blocks, components, LANES]; a block has LANES rows."""
 
     def __init__(self, gaussians: Struct) -> None:
-        """gaussians: its `tables` will contain the slots instead of the offloaded tables."""
+        """gaussians: the Gaussians whose SH tables are offloaded; slots replace these in its `tables`."""
         self.gaussians, self.device = gaussians, gaussians.device
         self.lanes = int(self.device.tuning["LANES"])
         self.tables: dict[str, NDArray[np.float32]] = {}
@@ -74,7 +74,7 @@ class HostTables:
         self.load(np.flatnonzero(is_visible))
 
     def load(self, blocks: NDArray[np.int64]) -> None:
-        """Load these blocks, in ascending order, into the slots."""
+        """Load blocks, given in ascending order, into the slots."""
         self.finish_download()
         if np.array_equal(blocks, self.loaded):
             return
@@ -102,7 +102,7 @@ class HostTables:
         self._downloads = {}
 
     def parts(self) -> Iterator[None]:
-        """Load all blocks into the slots in parts, yielding after each; then load the previous blocks again."""
+        """Load all blocks into the slots in parts, and yield after each part; finally restore the previous blocks."""
         previous_blocks, size = self.loaded, max(self._slots, MIN_ROWS // self.lanes)
         for first in range(0, self._blocks, size):
             self.load(np.arange(first, min(first + size, self._blocks)))
@@ -124,7 +124,7 @@ class HostTables:
         return tables
 
     def _first_slots(self, name: str, count: int) -> Array:
-        """Return the first `count` slots of a table, which share its memory."""
+        """Return a view of the first `count` slots of a table."""
         slots = self.gaussians.tables[name].array
         return Array(self.device, slots.buffer, (count, *slots.shape[1:]), slots.dtype)
 

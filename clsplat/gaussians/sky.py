@@ -1,4 +1,4 @@
-"""Represent a sky, the colors behind the Gaussians by direction, on the host, on a device, and in a file."""
+"""Represent a sky, a map from directions to colors behind the Gaussians, on the host, on a device, and in a file."""
 
 import json
 import logging
@@ -46,7 +46,7 @@ def texel_directions(side: int) -> Floats:
 
 
 def texel_indices(i: Integers, j: Integers, side: int) -> Integers:
-    """Return the indices of the texels in columns i and rows j, which may be from -1 to `side`.
+    """Return the indices of the texels in columns i and rows j, each from -1 to `side`.
 
     Beyond an edge, the map continues at the mirrored position of the same edge.
     """
@@ -107,7 +107,7 @@ class DeviceSky:
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """The colors behind a model by direction, as an octahedral map."""
+    """The colors behind a model for all directions, as an octahedral map."""
 
     texels: NDArray[np.float32]  # [side * side, 3], row by row
 
@@ -139,12 +139,12 @@ WITHOUT_SKY = "_without_sky"  # in the name of a model file next to one with Gau
 
 
 def sky_path(model: Path) -> Path:
-    """Return the path of a model's sky file; `_raw` and `_without_sky` models share that of the model."""
+    """Return the path of a model's sky file, which the `_raw` and `_without_sky` variants of the model share."""
     return model.with_name(f"{model.stem.removesuffix('_raw').removesuffix(WITHOUT_SKY)}_sky.json")
 
 
 def without_sky_path(model: Path) -> Path:
-    """Return the path of the model without the sky, next to a model file with Gaussians of the sky."""
+    """Return the path for the model without sky Gaussians, next to the model file that has them."""
     return model.with_name(f"{model.stem}{WITHOUT_SKY}{model.suffix}")
 
 

@@ -1,4 +1,4 @@
-"""Define protocols and helpers for modules that `gaussians.py` imports and that use its classes."""
+"""Define protocols and helpers for modules that `gaussians.py` imports, so that they need not import its classes."""
 
 import copy
 from typing import Any, ClassVar, Protocol
@@ -79,22 +79,22 @@ class GaussianGradients:
         return gradients
 
     def replace(self, arrays: dict[str, Array]) -> "GaussianGradients":
-        """Return a copy with other arrays, given by parameter name."""
+        """Return a copy with different arrays, given by parameter name."""
         gradients = copy.copy(self)
         gradients.arrays = arrays
         return gradients
 
     def fits(self, gaussians: Struct) -> bool:
-        """Return whether the shapes match the parameters of these Gaussians."""
+        """Return whether the gradients have the shapes of these Gaussians' parameters."""
         return {name: array.shape for name, array in self.arrays.items()} == _shapes(gaussians)
 
     def arguments(self) -> dict[str, Any]:
-        """Return the gradients that the projection kernels write, by the names of their arguments."""
+        """Return the gradients that the projection kernels write, by argument name."""
         return {**{f"grad_{name}": self.arrays[name] for name in PARAMETERS}, "grad_mean2d": self.mean2d}
 
 
 def _shapes(gaussians: Struct) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of trained tables by name; tables in host memory have the shape of their slots."""
+    """Return the shapes of the trained tables, by name.  For tables in host memory, return the shape of their slots."""
     return {name: gaussians.tables[name].array.shape for name in gaussians.trained}
 
 

@@ -24,7 +24,7 @@ DEGENERATE = {"not_finite": "not finite", "no_rotation": "without rotation", "fl
 
 
 def is_model(path: Path) -> bool:
-    """Return whether a path is a model, by name or content, or another binary file, rather than a pipeline file."""
+    """Return whether a path is a model, by name or content, or another binary file; False for pipeline files."""
     file = model_file(path)
     if file.suffix in (".yaml", ".yml"):
         return False
@@ -132,7 +132,7 @@ def _find_activated(model: Model) -> list[str]:
 
 
 def _ranges(model: Model) -> dict[str, list[float]]:
-    """Return minimum, median, and maximum of each quantity after activation."""
+    """Return the minimum, median, and maximum of each quantity after activation."""
     with np.errstate(over="ignore"):
         scales = np.exp(np.minimum(model.log_scales.astype(np.float64), 700))
     quantities: dict[str, NDArray[Any]] = {

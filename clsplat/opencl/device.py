@@ -39,7 +39,7 @@ LOG = logging.getLogger("clsplat")
 def raising_device_errors(action: str, device_name: str) -> Iterator[None]:
     """Convert runtime errors in the block to MemoryLimitError or DeviceError; `action` describes the block.
 
-    Some runtimes allocate device memory on first use, and run out of it only at a launch or a copy.
+    Some runtimes allocate device memory on first use, so that a launch or a copy may be the first call to fail.
     """
     try:
         yield
@@ -52,7 +52,7 @@ def raising_device_errors(action: str, device_name: str) -> Iterator[None]:
 
 
 class Timings:
-    """Kernel times on the device, measured by profiling events while `sampling` is True.
+    """Kernel times, measured by profiling events while `sampling` is True.
 
     Events are dropped as soon as they are read: some drivers slow down when many are alive.
     """
@@ -82,7 +82,7 @@ class Timings:
 
 
 class Buffer(cl.Buffer):
-    """Device memory that supports weak references, unlike pyopencl's class."""
+    """A buffer in device memory that, unlike pyopencl's class, supports weak references."""
 
 
 class Array:
@@ -147,7 +147,7 @@ class Array:
 
 
 class Device:
-    """An open OpenCL device: one context, in-order commands, and programs that are built once.
+    """An open OpenCL device with one context and an in-order queue; it builds each program only once.
 
     A `with` block waits for all work when it ends.  Memory is released with the arrays, and the device with the last
     object that uses it.
@@ -282,7 +282,7 @@ def create_context(device: Any) -> Any:
 def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:
     """Open the device whose name contains `device`, by default the one that `choose` selects.
 
-    A Device that is already open is returned.  Raises DeviceError if no device matches, and ConfigError for an open
+    An open Device is returned unchanged.  Raises DeviceError if no device matches, and ConfigError for an open
     device with another schedule.
     """
     if device is None or isinstance(device, str):
@@ -295,7 +295,7 @@ def open_device(device: str | Device | None = None, schedule: Schedule = "auto")
 
 
 def _round_up_to_lines(size: int) -> int:
-    """Round a size up to a positive multiple of 64 bytes: vector loads may read past the last value of a buffer."""
+    """Round a size up to a positive multiple of 64 bytes, because vector loads may read past the end of a buffer."""
     return max(64, -(-size // 64) * 64)
 
 
@@ -388,7 +388,7 @@ def group_limit(kernel: Any, device: Any) -> int:
 def underreports_group_limit(info: DeviceInfo, limit: int, multiple: int) -> bool:
     """Return whether a runtime reports a group size limit that is too small, as rusticl does.
 
-    It reports `multiple`, the number of work-items that run together, but can run larger groups.  Mesa 22.3.6 reports
+    It reports `multiple`, the number of work-items that run together, but supports larger groups.  Mesa 22.3.6 reports
     32 for a kernel that requires 256.
     https://gitlab.freedesktop.org/mesa/mesa/-/blob/mesa-22.3.6/src/gallium/frontends/rusticl/api/kernel.rs
     """
@@ -396,7 +396,7 @@ def underreports_group_limit(info: DeviceInfo, limit: int, multiple: int) -> boo
 
 
 def group_multiple(kernel: Any, device: Any) -> int:
-    """Return the number of work-items that a device runs together.  Group sizes should be multiples of it."""
+    """Return the number of work-items that a device runs together.  Group sizes should be a multiple of this number."""
     return int(kernel.get_work_group_info(cl.kernel_work_group_info.PREFERRED_WORK_GROUP_SIZE_MULTIPLE, device))
 
 
@@ -417,7 +417,7 @@ class Kernel:
             )
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
-        """Launch with `items`, rounded up to full work-groups, or with `groups`.  If a size is 0, do nothing."""
+        """Launch `items` work-items, rounded up to full work-groups, or `groups` work-groups; none if a size is 0."""
         total = items or groups
         size = (total,) if isinstance(total, int) else total
         local = self.group[: len(size)]

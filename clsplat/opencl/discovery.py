@@ -46,7 +46,7 @@ class DeviceInfo:
         return f"{self.name} ({self.kind}) on {self.platform}"
 
     def fault(self) -> str | None:
-        """Return None if the device is large enough and runs a test kernel, else the fault as a sentence."""
+        """Return None if the device supports large enough work-groups and runs a test kernel, else the fault."""
         min_group = int(tuning_macros(self, resolve_schedule(self, "auto"))["GROUP"])
         if self.group < min_group:
             return f"its work-groups have at most {self.group} items; {min_group} are needed"
@@ -146,7 +146,7 @@ def choose(device_name: str | None = None) -> DeviceInfo:
 def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
     """Return the sort key: GPUs first, discrete before integrated, by units times clock; then CPUs, then others.
 
-    The number of units is not enough, because some vendors count entire processors, and others their parts.
+    The number of units alone does not suffice, because vendors define compute units differently.
     """
     gpu = info.kind == "GPU"
     return ("GPU", "CPU", "other").index(info.kind), gpu and info.unified, -info.units * info.clock if gpu else 0
@@ -175,7 +175,7 @@ def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "s
 
 
 def tuning_macros(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
-    """Return the macros that kernels are built with for a device; cl_kernels/common.h explains them."""
+    """Return the macros with which kernels are built for a device; cl_kernels/common.h explains them."""
     if schedule == "wide":
         return {
             "LANES": 16 if info.float_width >= 16 else 8,

@@ -39,7 +39,7 @@ def kernel_cache_advice() -> str:
 
 
 def require_space() -> None:
-    """Raise OutputError if built kernels may not fit, since compilers then abort the process."""
+    """Raise OutputError if there may be no space for built kernels, because compilers then abort the process."""
     limit = process_limit("RLIMIT_FSIZE")
     if limit is not None and limit < MIN_FILE_SIZE:
         raise OutputError(

@@ -1,4 +1,4 @@
-"""Build and run two small kernels on a device, given its platform and device index; exit code 0 means success.
+"""Build and run two small kernels on a device, given by its platform and device index; exit code 0 means success.
 
 Without arguments, load all runtimes and query their devices.
 """

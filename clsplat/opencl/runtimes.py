@@ -48,7 +48,7 @@ _ADVICE = (  # text in the output of a failed test kernel, and advice
 
 
 def prepare() -> None:
-    """Prepare the environment for the loader: make runtimes' caches writable, and add Intel's.  Raises OutputError."""
+    """Prepare the environment for the loader: make caches writable, and add Intel's runtime.  Raises OutputError."""
     cache_folder()
     _add_intel_runtime()
 
@@ -65,13 +65,13 @@ def no_device_error(fault: str, advice: str = "") -> DeviceError | MemoryLimitEr
 
 
 def no_device_advice() -> str:
-    """Return advice for a machine without devices: correct environment variables, or install a runtime."""
+    """Return advice for a machine without devices: to correct environment variables, or to install a runtime."""
     variables = _user_variables()
     return f"{variables} may hide the runtimes: correct or unset it; or {INSTALL}" if variables else INSTALL
 
 
 def _user_variables() -> str:
-    """Return the VARIABLES that the user has set, as `NAME=VALUE, …`; '' if there are none."""
+    """Return those of VARIABLES that the user has set, as `NAME=VALUE, …`; '' if there are none."""
     folders = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # in values that `prepare` has set
     values = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, folders[0]).startswith(folders)}
     return ", ".join(f"{name}={quote(value)}" for name, value in values.items())
@@ -106,7 +106,7 @@ def check_runtimes(loader: str) -> None:
 
 
 def _drivers() -> dict[Path, str]:
-    """Return the library of each runtime by the file that the loader reads: an .icd file, or the library itself."""
+    """Return the library of each runtime.  Keys are the files that the loader reads: .icd files or the libraries."""
     vendors = Path(os.environ.get("OCL_ICD_VENDORS") or SYSTEM_DRIVERS)
     files = sorted(vendors.glob("*.icd")) if vendors.is_dir() else [vendors]
     drivers = {
@@ -121,7 +121,7 @@ def _drivers() -> dict[Path, str]:
 
 
 def _find_faulty_driver(drivers: Mapping[Path, str], fault: str) -> DeviceError:
-    """Load each driver separately, and return an error about the first one that crashes the process."""
+    """Load each driver separately, and return the error for the first one that crashes the process."""
     remedy = f"correct or unset {variables}" if (variables := _user_variables()) else OTHER_DRIVERS
     for path, library in drivers.items():
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
@@ -134,7 +134,7 @@ def _find_faulty_driver(drivers: Mapping[Path, str], fault: str) -> DeviceError:
 
 
 def _loading_fault(variables: Mapping[str, str]) -> str | None:
-    """Load all runtimes in a child process.  Return its failure as a verb phrase, or None if it lists the devices."""
+    """Load all runtimes in a child process.  Return None if it lists the devices, else its failure as a verb phrase."""
     result = run_module(PROBE_MODULE, seconds=LOADING_SECONDS, variables=variables)
     if LOADED in result.output or LOADING not in result.output:  # without the first line, loading did not start
         return None
@@ -167,7 +167,7 @@ def _add_intel_runtime() -> None:
 def probe_fault(key: str, platform: int, device: int) -> str | None:
     """Return None if the device builds and runs a test kernel, else a sentence with the fault and a remedy.
 
-    `key` identifies the runtime.  Only successes are recorded, so that a repaired runtime is tested again.  A device
+    key: identifies the runtime.  Only successes are recorded, so that a repaired runtime is tested again.  A device
     that fails is tested again with empty caches of built kernels.
     """
     content = PROBE.read_bytes() + key.encode()

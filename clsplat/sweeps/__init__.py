@@ -1,1 +1,1 @@
-"""Many runs: the matrix, the store of cells, the engines that run them, and comparisons."""
+"""Run many pipelines: the store of a sweep's cells, the engines that run them, and comparisons."""

@@ -1,4 +1,4 @@
-"""Run cells on an engine, keep their results in a store, and copy them to folders with the names of the cells."""
+"""Run cells on an engine, store their results, and copy these to folders with the names of the cells."""
 
 import logging
 import threading
@@ -92,13 +92,13 @@ class Batch:
         self._count, self._last_report = Count("steps", sum(self._steps.values())), time.monotonic()
 
     def ready(self) -> None:
-        """Prepare for the first cell.  Called once, before the cell starts."""
+        """Prepare for the first cell.  This is called once, before that cell starts."""
 
     def on_change(self, started: str | None) -> None:
-        """React to a change.  started: name of the cell that has started; None: a cell has ended."""
+        """Handle the start or the end of a cell.  started: name of the started cell, or None if a cell ended."""
 
     def require_lock(self) -> None:
-        """Raise OutputError if another process now owns the folder."""
+        """Raise OutputError if another process has taken over the folder."""
 
     def run(self, execution: Execution, device: str | None) -> None:
         """Run every cell whose result is not in the store, and record the failed cells in `failures`.
@@ -136,7 +136,7 @@ class Batch:
         self._count.reach(min(completed_steps, self._count.total))
 
     def _is_stopped(self) -> bool:
-        """Report progress, because the inline engine calls this regularly; return whether a signal has arrived."""
+        """Report progress, since the inline engine calls this regularly; return whether a signal has arrived."""
         self._report_progress()
         return self._stop.is_set()
 
@@ -188,7 +188,7 @@ class Batch:
         self.on_change(None)
 
     def _copy(self, cell: CellRun) -> None:
-        """Copy the result of a cell to the folder with the cell's name, unless that folder has it already."""
+        """Copy the result of a cell to the folder with the cell's name, unless it is there already."""
         result, target = self.store.folder(cell.key).result, self.out / cell.name
         with self.failures.recording(cell.name):
             if self.overwrites or not has_result(result, target):
@@ -220,7 +220,7 @@ def _engine(execution: Execution, store: Store, device: str | None, is_stopped: 
 
 
 def pending_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> PendingCell:
-    """Run the `prepare` steps of a cell, and return it as a cell that waits for a device.
+    """Run the `prepare` steps of a cell, and return the cell, ready for a device.
 
     Raises ConfigError, DataError, and the errors of the steps.
     """
@@ -249,7 +249,7 @@ def run_one(
 ) -> Path:
     """Run a cell of a matrix, or a pipeline as a cell, unless the store has its result; return the result's folder.
 
-    root: the folder of the store.  index: index of the cell in the matrix, from 0.  Raises ClsplatError with the exit
+    root: the folder of the store.  index: index of the cell in the matrix.  Raises ClsplatError with the exit
     code of the run.
     """
     experiment = load_experiment(pipeline, overrides)

@@ -41,14 +41,14 @@ class SceneFacts:
 
 @cache
 def code_digest() -> str:
-    """Return a hash of the program: the package, its kernels, and the versions of libraries that affect the bits."""
+    """Return a hash of the package, its kernels, and the versions of libraries that affect the bits."""
     libraries = [*_versions(*LIBRARIES), f"zlib {zlib.ZLIB_RUNTIME_VERSION}", _builtin_zstd()]
     return _digest([__version__, *list_sources(), *libraries])
 
 
 @cache
 def tools_digest() -> str:
-    """Return a hash of the versions of other libraries that affect the output of `prepare`."""
+    """Return a hash of the versions of all other libraries that affect the output of `prepare`."""
     return _digest(_versions("pycolmap"))
 
 
@@ -156,7 +156,7 @@ class CellRun:
         return json.dumps(asdict(self))
 
     def require_files(self) -> None:
-        """Raise DataError if an input file on this machine differs from the file whose hash is in the key."""
+        """Raise DataError if an input file on this machine has another hash than the file used for the key."""
         for path, digest in self.files.items():
             if hash_content(Path(path)) != digest:
                 raise DataError(

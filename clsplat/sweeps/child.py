@@ -56,9 +56,9 @@ def fill_command(command: Command, pipeline: Path, out: Path) -> list[str]:
 
 
 def supervise(attempt: CellAttempt, command: Command, is_stopped: Callable[[], bool], cores: Cores = ()) -> int:
-    """Run an attempt to its end; return its exit code, or the negative number of the signal that ended it.
+    """Wait until an attempt ends; return its exit code, or the negative number of the signal that ended it.
 
-    is_stopped: returns whether the run has to save its state and end.  cores: the cores that the run is pinned to;
+    is_stopped: returns whether the run has to save its state and end.  cores: the cores to which the run is pinned;
     empty: the cores of this process.  Raises LeaseLost.
     """
     with raising_output_error(attempt.path), (attempt.path / ERRORS).open("wb") as errors:

@@ -1,4 +1,4 @@
-"""Find devices and their bits classes.  A class is the hash of the results of a fixed run.
+"""Find devices and their bits classes.  A bits class is the hash of a fixed run's results.
 
 The name of a device is not enough, because different runtimes may compute the same bits, and the same runtime may
 compute different bits on another processor.  Devices of the same class can continue each other's cells.
@@ -31,7 +31,7 @@ Parts = list[tuple[int, ...]]  # for each run, the cores that it is pinned to; (
 
 
 def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
-    """Return, for each device, the cores of each of its runs.
+    """Assign CPU cores to the runs on each device; return a list of the runs' cores for each device.
 
     packing: number of runs on a CPU; other devices have one run.  Raises ConfigError if there are more runs than cores.
     """
@@ -83,7 +83,7 @@ def slot_from_worker(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
 def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) -> list[DeviceSlot]:
     """Return slots for the working devices of this machine, or for named devices, with their bits classes.
 
-    packing: number of runs that share a CPU; each has a slot.
+    packing: number of runs that share a CPU, each with a slot.
     Raises DeviceError if no device or a named device does not work, and ConfigError if there are more runs than cores.
     """
     infos = list_devices()
@@ -106,7 +106,7 @@ def device_query(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
 
 def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
-    """Return the bits class of a device, which is cached by device, driver, and program version.
+    """Return the bits class of a device; results are cached by device, driver, and program version.
 
     Raises DeviceError if the fixed run fails.
     """

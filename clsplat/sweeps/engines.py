@@ -169,7 +169,7 @@ class Dispatcher:
         return slot in ([candidate for candidate in allowed if candidate.memory > pending.too_small] or allowed)
 
     def _allowed_slots(self, pending: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
-        """Return the devices on which a cell may run.  A started cell stays in its class while it has devices."""
+        """Return the devices on which a cell may run.  A started cell stays in its class if possible."""
         if self.is_same:
             return [slot for slot in slots if slot.bits == self.bits]
         classes = {slot.bits for slot in slots if not pending.too_small}

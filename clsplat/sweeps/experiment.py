@@ -162,7 +162,7 @@ class Job:
         execution: dict[str, Any] | None = None,
         steps: int | None = None,
     ) -> "Job":
-        """Open the run in a folder to continue it.  Raises ConfigError or DataError.
+        """Return a job that continues the run in a folder.  Raises ConfigError or DataError.
 
         scene: the new folder of the photos, if they have moved.  execution: as for `open`.  steps: the new number of
         training steps.
@@ -188,7 +188,7 @@ class Job:
         return describe.describe(self.work, self.state, device, self.start, with_time=True)
 
     def run(self, device: str | Device | None = None, live: int | None = None, minutes: float | None = None) -> None:
-        """Run the pipeline or matrix.  Nothing runs again if its outputs are complete and up to date.
+        """Run the pipeline or matrix, except for runs whose outputs are complete and up to date.
 
         live: the port of a live preview; 0: any free port; None: no preview.
         minutes: a time budget, which starts when the photos have been read and determines the number of steps.
@@ -293,7 +293,7 @@ def read_cells(experiment: Experiment, out: Path, start: Start) -> tuple[dict[st
 
 
 def check_matrix_folder(state: RunState) -> None:
-    """Raise ConfigError if the folder has a single run, or other files with names that a matrix would write."""
+    """Raise ConfigError if the folder has a single run, or files with names that a matrix would write."""
     outputs.check_names(state, MATRIX_FILES)
     outputs.require_inside(state.out, [state.out / PREPARED, state.out / UNDISTORTED])  # cells share them
     out = state.out

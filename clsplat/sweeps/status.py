@@ -70,7 +70,7 @@ def _steps(pipeline: dict[str, Any]) -> int | None:
 
 
 def _result_metrics(folder: CellFolder) -> dict[str, Any]:
-    """Return the PSNR and SSIM, and the numbers of steps and Gaussians, of a result; empty if they cannot be read.
+    """Return the PSNR, the SSIM, and the numbers of steps and Gaussians of a result; empty if they cannot be read.
 
     PSNR and SSIM are means over the test views, or the training views if there are none, at the first downscale factor.
     """

@@ -11,7 +11,7 @@
     events/<host>-<process>.jsonl   one file per process, so that no two append to the same file
 
 Engines may start a cell more than once, but each cell has a single result: attempts share no files, the bits do not
-depend on the process that runs the cell, and publishing is a rename.
+depend on the process that runs the cell, and a result is published by a rename.
 """
 
 import hashlib
@@ -88,7 +88,7 @@ def copy_files(source: Path, target: Path, excluded: Collection[str]) -> None:
 def link_or_copy(source: Path, target: Path) -> None:
     """Hard-link a file, or copy it if links are not possible.  Raises OSError.
 
-    Both files may share their data, so neither must be modified in place.
+    The files may share their data, so neither may be modified in place.
     """
     try:
         os.link(source, target)
@@ -174,7 +174,7 @@ class CellAttempt:
 
     @property
     def start_rank(self) -> Rank:
-        """The rank of the checkpoint that the attempt continued from."""
+        """The rank of the checkpoint from which the attempt continued."""
         return _parse_rank(str(self.lease.get("from", "")))
 
     @property
@@ -186,7 +186,7 @@ class CellAttempt:
         return math.inf
 
     def continue_from(self, others: Iterable["CellAttempt"]) -> None:
-        """Copy the newest readable checkpoint, and the other files of its attempt, by hard links if possible.
+        """Copy the attempt with the newest readable checkpoint into this folder, by hard links if possible.
 
         Damaged checkpoints are skipped.  Raises OutputError.
         """
@@ -251,7 +251,7 @@ def _parse_rank(name: str) -> Rank:
 
 
 def hash_bits(folder: Path, files: dict[str, str]) -> str:
-    """Return a hash of everything that a device computed: the model files, and metrics other than times.
+    """Return a hash of everything that a device computed: the model files, and all metrics except times.
 
     files: hashes of the run's files, by name.
     """
@@ -346,9 +346,9 @@ class CellFolder:
         return attempt
 
     def failures(self, since: float) -> list[CellAttempt]:
-        """Return the failed attempts since which there is no newer readable checkpoint.
+        """Return the failed attempts after the newest readable checkpoint.
 
-        since: attempts of callers that started earlier are ignored; by the clock of the store.
+        since: attempts of callers that started before this time, by the clock of the store, are ignored.
         """
         attempts = self.attempts()
         newest = next((rank for rank, *_ in readable_checkpoints(attempts)), (False, 0))
@@ -357,7 +357,7 @@ class CellFolder:
     def publish(self, attempt: CellAttempt) -> dict[str, Any]:
         """Write the manifest of an attempt, rename the attempt to the result, and return the result's manifest.
 
-        If another attempt was published first, the bits of both are compared.  Raises BitsMismatch if they differ, and
+        If another attempt was published first, the bits of both are compared.  Raises BitsMismatch if these differ, and
         LeaseLost if the attempt was removed because its process was frozen for too long.
         """
         attempt.require_lease()
@@ -453,7 +453,7 @@ class Store:
         return without_links(self.root, PREPARED)
 
     def undistorted_folder(self, scene: str, code: str) -> Path:
-        """Return the folder of a scene's undistorted photos.  scene, code: the fingerprints in the spec of a cell."""
+        """Return the folder of a scene's undistorted photos.  scene, code: fingerprints in the spec of a cell."""
         return without_links(self.root, UNDISTORTED, f"{scene[:16]}-{code}", Owner.current().host_slug).parent
 
     def folder(self, key: str) -> CellFolder:
@@ -468,7 +468,7 @@ class Store:
         return [self.folder(name) for name in names if is_key(name)]
 
     def now(self) -> float:
-        """Return the current time of the store's file system, s, which is the same for all machines."""
+        """Return the current time of the store's file system in seconds, which is the same for all machines."""
         clock = without_links(self.root, EVENTS, f".{self._process_name}.clock")
         with raising_output_error(clock):
             make_folder(clock.parent)
@@ -544,9 +544,9 @@ class Store:
             os.utime(cancel_file)
 
     def is_cancelled(self, names: Sequence[str], since: float) -> bool:
-        """Return whether there is a request to stop cells under one of these names that started at `since`.
+        """Return whether a request applies to cells with one of these names that started at `since`.
 
-        since: by the clock of `now`.
+        since: a time by the clock of `now`.
         """
         for name in (ALL, *filter(None, names)):
             with suppress(OSError):

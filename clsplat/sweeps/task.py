@@ -1,4 +1,4 @@
-"""Run a cell in one or more attempts until it is published, fails, or is stopped.  All engines use this module."""
+"""Run a cell in one or more attempts until it is published, fails, or is stopped, on behalf of any engine."""
 
 import logging
 import os
@@ -108,7 +108,7 @@ def _run_cell(
 
 
 def _prepare_attempt(cell: CellRun, store: Store, folder: CellFolder, attempt: CellAttempt) -> None:
-    """Write the pipeline file of an attempt, and links to the shared output of `prepare` and undistorted photos.
+    """Write the pipeline file of an attempt, and link the shared output of `prepare` and the undistorted photos.
 
     Where links are not possible, each cell creates these files itself.  Raises OutputError.
     """
@@ -127,7 +127,7 @@ def _prepare_attempt(cell: CellRun, store: Store, folder: CellFolder, attempt: C
 
 
 def _require_same_scene(cell: CellRun, attempt: CellAttempt) -> None:
-    """Raise DataError if the photos or other input files differ from the files that were hashed for the cell's key."""
+    """Raise DataError if the photos or other input files differ from the files hashed for the cell's key."""
     cell.require_files()
     for name, key in ((PREPARE_SUMMARY, "inputs"), (INPUTS, "digest")):
         if not (attempt.path / name).is_file():

@@ -1,1 +1,1 @@
-"""Create models from models: blocks, levels of detail, compression, further training."""
+"""Create models from other models: train in blocks, build levels of detail, compress, and fine-tune."""

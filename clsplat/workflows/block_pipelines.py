@@ -62,7 +62,7 @@ def block_pipeline(
 ) -> Pipeline:
     """Return the pipeline of a block: from its initial Gaussians to its model, cropped to its cell.
 
-    extent: of the full scene, scene units; fraction: of the steps to train, with rates as in `_with_fewer_steps`.
+    extent: of the full scene, in scene units; fraction: of the training steps, with rates as in `_with_fewer_steps`.
     """
     data, stage_count, cell = pipeline.resolved(), _count_until_last_edit(pipeline), block.box.model_dump()
     stages = [_limit_growth(stage, block) for stage in _with_start(data["stages"][:stage_count], start)]
@@ -112,7 +112,7 @@ def _with_fewer_steps(settings: PipelineFile, fraction: Fraction) -> PipelineFil
 
 
 def _count_until_last_edit(pipeline: Pipeline) -> int:
-    """Return the number of stages up to the last one that changes the model."""
+    """Return the number of stages up to and including the last one that changes the model."""
     return max(i for i, stage in enumerate(pipeline.stages, 1) if stage.edits or isinstance(stage, Optimize))
 
 

@@ -65,7 +65,7 @@ from clsplat.workflows.partition import MIN_COVERAGE, Block, Partition, Partitio
 def block_seconds(
     blocks: Sequence[Block], pipelines: Mapping[str, Pipeline], size: tuple[int, int], units: int
 ) -> dict[str, list[float]]:
-    """Return the training time of each block, s, with its initial and with its maximum number of Gaussians.
+    """Return two training times, s, for each block: with its initial and with its maximum number of Gaussians.
 
     pipelines: by block name; size: of a photo, px; units: compute units of the device.
     """
@@ -78,7 +78,7 @@ def block_seconds(
 
 
 def _gaussian_range(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the initial and the maximum number of Gaussians of a block.  Without a limit, the maximum is a guess."""
+    """Return the initial and maximum numbers of Gaussians of a block.  Without a limit, the maximum is a guess."""
     initial_count, pixels = int(block.start.sum()), size[0] * size[1]
     limits = [
         max_gaussians(stage, pixels) or block.pairs * MAX_PER_PIXEL * pixels for stage in _optimize_stages(pipeline)
@@ -185,9 +185,9 @@ class Blocks:
         return block_pipeline(self.pipeline, block, self.out / f"{block.name}.ply", partition.extent, fraction)
 
     def train(self, partition: Partition) -> list[tuple[Block, Path]]:
-        """Train the unfinished blocks; return all blocks with their models, in order.
+        """Train the unfinished blocks; return all blocks with their model files, in order.
 
-        A block with no Gaussians left has no model.  A failed block does not stop the others; an error at the end names
+        A block without Gaussians has no model.  A failed block does not stop the others; an error at the end names
         the first failure and has its exit code.
         """
         files, failures = [], Failures("blocks")
@@ -217,7 +217,7 @@ class Blocks:
         return files
 
     def _train_as_cells(self, execution: Execution, pipelines: dict[str, Pipeline], failures: Failures) -> None:
-        """Train the unfinished blocks as cells of a sweep store; their runs are placed in the block folders."""
+        """Train the unfinished blocks as cells of a sweep store, and copy their runs to the block folders."""
         cells = [
             MatrixCell(name, pipeline)
             for name, pipeline in pipelines.items()
@@ -289,7 +289,7 @@ NOTE = "memory is at the start of training; times range from no growth to an est
 def table(manifest: dict[str, Any]) -> str:
     """Format a manifest as text.  MiB: device memory at the start of training.
 
-    If the manifest has times, they range from no growth to the maximum number of Gaussians.
+    Training times, if there are any, are ranges: from no growth to the maximum number of Gaussians.
     """
     scene_row = [
         "whole",
@@ -334,7 +334,7 @@ def _format_mib(size: int) -> str:
 def plan_blocks(
     scene: Path, blocks: int, pipeline: str = "blocks", device: str | Device | None = None
 ) -> dict[str, Any]:
-    """Partition the scene's points, and return the manifest with estimated times.  Nothing is written.
+    """Partition the scene's points, and return the manifest with estimated times, without writing files.
 
     Raises ConfigError for an invalid number of blocks, and DataError if the scene has too few points.
     """

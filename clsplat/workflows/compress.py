@@ -1,4 +1,4 @@
-"""Compress a model to a target: search over pruning ratios and SH settings, measuring every file."""
+"""Compress a model to a target: search over pruning ratios and SH settings, and measure every file."""
 
 import json
 import logging
@@ -149,7 +149,7 @@ class CompressionTarget:
         return "allow a larger loss, or train longer with --steps"
 
     def is_decided(self, rung: Sequence[Point], psnr: float) -> bool:
-        """Return whether fewer Gaussians cannot help, because every file of a rung fits, or none is good enough."""
+        """Return whether the search can stop, because every file of a rung is small enough, or none is good enough."""
         results = [self.is_met(point, psnr) for point in rung]
         return all(results) if self.max_bytes is not None else not any(results)
 
@@ -160,7 +160,7 @@ HEADINGS = ("Gaussians", "kept", "SH degree", "quality", "MB", "of the model", "
 
 
 def cells(point: Point, source: Point) -> list[str]:
-    """Return a row of the table."""
+    """Return the cells of the file's row in the table of results."""
     return [
         f"{point.gaussians:,}",
         f"{point.keep:.0%}",
@@ -216,7 +216,7 @@ def _verdict(target: CompressionTarget, source: Point, chosen: Point | None) -> 
 
 
 def _lines(target: CompressionTarget, source: Point, points: Sequence[Point]) -> list[Line]:
-    """Return a chart line for each fraction of the Gaussians, and one for the target."""
+    """Return a chart line for each fraction of the Gaussians, and a line for the target."""
     keeps = dict.fromkeys(point.keep for point in points)
     lines = [
         Line(sorted((p.bytes / 1e6, p.psnr) for p in points if p.keep == keep), f"{keep:.0%} of the Gaussians")
@@ -241,7 +241,7 @@ RECORD, PAGE, TRIALS = "compress.json", "compress.html", "trials"
 
 @dataclass
 class Search:
-    """A search in its folder, with all measurements so far."""
+    """A search, the folder in which it runs, and all measurements so far."""
 
     out: Path
     target: CompressionTarget
@@ -256,7 +256,7 @@ class Search:
         return self.target.best(self.points, self.source.psnr)
 
     def data(self) -> dict[str, Any]:
-        """Return the record of the search as data for JSON."""
+        """Return the record of the search as a dictionary for JSON."""
         chosen = self.chosen
         return {
             **self.identity,
@@ -268,7 +268,7 @@ class Search:
         }
 
     def write(self, result: str = "") -> None:
-        """Write the measurements as JSON and as a page that links to the result."""
+        """Write the measurements as JSON, and as an HTML page that links to the result."""
         write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
         page_arguments = self.target, self.source, self.points, self.chosen, self.split
         write_text(self.out / PAGE, page(*page_arguments, self.scene, self.identity["model"], result))
@@ -341,7 +341,7 @@ def _measure_rung(ladder: Ladder, source: Path, keep: float, form: Format, measu
 
 
 def _sh_settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
-    """Return the distinct pairs of SH degree and quality for a model of this degree; a single pair for degree 0."""
+    """Return the pairs of SH degree and quality to try for a model of this degree; a single pair for degree 0."""
     settings = ((min(limit, degree), quality) for limit, quality in SETTINGS[form])
     return dict.fromkeys((limit, quality if limit else "balanced") for limit, quality in settings)
 

@@ -67,7 +67,7 @@ class Tuning:
         return replace(pipeline, settings=stretch(pipeline.settings, Fraction(self.steps, recipe_steps)))
 
     def train(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
-        """Run a pipeline in a folder as `train_in_folder` does; return the file that it writes."""
+        """Call `train_in_folder` with the device of this tuning."""
         return train_in_folder(pipeline, folder, self.device, file)
 
     def _scene(self) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def require_steps(steps: int) -> None:
 
 
 def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
-    """Return the stages with these names, in order, with start steps relative to the first of them."""
+    """Return the stages with these names, in order.  Their start steps count from the first of these stages."""
     selection, remaining, earlier_steps = [], iter(stages), 0
     for name in names:
         while not _has_name(stage := next(remaining), name):
@@ -135,7 +135,7 @@ def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
 
 
 def _shift_start(training: Any, steps: int) -> Any:
-    """Subtract `steps` from the start steps of a training's inner stages, which count from the start of the run."""
+    """Subtract `steps` from the start steps of a training stage's inner stages, given from the start of the run."""
     keys = training[TRAINING]
     during = [
         {name: {**inner, **({"start": inner["start"] - steps} if "start" in inner else {})}}
@@ -146,7 +146,7 @@ def _shift_start(training: Any, steps: int) -> Any:
 
 
 def _has_name(stage: Any, name: str) -> bool:
-    """Return whether a stage of a pipeline file, a string or a mapping, has this name."""
+    """Return whether a stage of a pipeline file has this name.  stage: a string or a mapping."""
     return bool(stage == name or (isinstance(stage, dict) and name in stage))
 
 
@@ -157,7 +157,7 @@ LABELS = {"sha256": "the model's bytes"}  # of keys of an identity, for messages
 
 @contextmanager
 def claim_folder(out: Path, identity: dict[str, Any], record: str, content: str, remedy: str) -> Iterator[None]:
-    """Create and lock a folder, write the identity of the work to its record, and remove files of killed processes.
+    """Create and lock a folder, write the identity of the work to a record, and remove files of killed processes.
 
     identity: inputs and options of the work, by key; content: a noun for messages, such as "a search"; remedy: the
     alternative to this folder, such as "another --out".
@@ -176,7 +176,7 @@ def claim_folder(out: Path, identity: dict[str, Any], record: str, content: str,
 
 
 def _require_same_identity(out: Path, identity: dict[str, Any], record: str, content: str, remedy: str) -> None:
-    """Raise ConfigError if a folder has the record of other inputs, or files but no record."""
+    """Raise ConfigError if a folder has a record of other inputs, or has files but no record."""
     if not path_exists(out / record):
         if path_exists(out) and not (out.is_dir() and all(_is_leftover(path.name) for path in out.iterdir())):
             raise ConfigError(f"{out}: contains files that are not part of {content}; give {remedy}")

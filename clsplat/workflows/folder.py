@@ -1,4 +1,4 @@
-"""Report the state of a folder, a run, a sweep store, or a scene in blocks, and verify its files."""
+"""Report the state of a folder that contains a run, a sweep store, or a scene in blocks, and verify its files."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -17,7 +17,7 @@ RECORD, COARSE, MERGED, MANIFEST = "blocks.json", "coarse", "merged", "partition
 
 
 def block_name(number: int) -> str:
-    """Return the name that a block's folder and its initial model have."""
+    """Return the name of a block's folder and of its initial model."""
     return f"block_{number:02d}"
 
 
@@ -27,14 +27,14 @@ def is_in_blocks(folder: Path) -> bool:
 
 
 def parse_status(folder: Path) -> dict[str, Any]:
-    """Return the status of a folder with a scene in blocks, a sweep store, or a run.  Raises DataError."""
+    """Return the status of a folder that contains a scene in blocks, a sweep store, or a run.  Raises DataError."""
     if is_in_blocks(folder):
         return blocks_status(folder)
     return store_status(folder) if is_store(folder) else run_status(RunState.read(folder))
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a scene in blocks with `verify_blocks`, and anything else with `clsplat.runs.verify.check`."""
+    """Call `verify_blocks` for a scene in blocks, and `clsplat.runs.verify.check` otherwise."""
     return verify_blocks(Path(pipeline)) if is_in_blocks(Path(pipeline)) else verify.check(pipeline)
 
 
@@ -60,7 +60,7 @@ def blocks_status(out: Path) -> dict[str, Any]:
 
 
 def verify_blocks(out: Path) -> dict[str, Any]:
-    """Verify all runs of a scene in blocks and the files next to them.
+    """Verify all runs of a scene in blocks and the files that they share.
 
     Returns the keys of `clsplat.runs.verify.verify`, and `remedy`.
     """

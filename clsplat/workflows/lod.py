@@ -58,7 +58,7 @@ class LodPlan:
 
 @dataclass(frozen=True)
 class DetailLevel:
-    """A level of detail, with its PSNR in dB before quantization if there are photos."""
+    """A level of detail.  If there are photos, it includes the PSNR in dB before quantization."""
 
     model: Model
     merged_psnr: float | None = None  # before training
@@ -75,7 +75,7 @@ class LevelTrainer:
         self.tuning = Tuning("lod", model.source, model.gaussians, self.steps, model.device)
 
     def lock(self) -> AbstractContextManager[None]:
-        """Return a context that locks the training folder, if anything is trained."""
+        """Return a context that locks the training folder if levels are trained."""
         if not self.steps or self.plan.levels == 1:
             return nullcontext()
         identity: dict[str, Any] = {"sha256": sha256(model_file(self.source.file)), "scene": str(self.source.folder)}
@@ -164,7 +164,7 @@ def _block_cost(tables: Tables, mass: Floats, log_volume: Floats, first: Rows, s
 
 
 def _neighbors(means: Floats) -> tuple[Rows, Rows]:
-    """Return pairs of a row and one of its nearest neighbors: lower row first, unique, in ascending order.
+    """Return unique pairs of rows that are nearest neighbors, lower row first, in ascending order.
 
     Rows at the same position form a chain, and only its first row has neighbors at other positions.
     """
@@ -182,7 +182,7 @@ def _neighbors(means: Floats) -> tuple[Rows, Rows]:
 
 
 def _clipped_tables(model: Model) -> Tables:
-    """Return the tables in float64, with unit quaternions, clipped to the range of the formulas."""
+    """Return the tables in float64, with unit quaternions, and with values clipped to the range of the formulas."""
     tables = {name: table.astype(np.float64) for name, table in model.tables().items()}
     tables["quats"] = unit(tables["quats"])
     tables["log_scales"] = np.clip(tables["log_scales"], *LOG_SCALES)
@@ -207,7 +207,7 @@ MIN_GAUSSIANS = 1_000_000  # below this, PlayCanvas recommends a single SOG
 def levels_of_detail(
     model: Path, folder: Path, scene: Path | None = None, plan: LodPlan | None = None, device: Any = None
 ) -> dict[str, Any]:
-    """Write levels of detail as streamed SOG; return the `folder`, its `bytes`, the measured `split`, and the `levels`.
+    """Write levels of detail as streamed SOG.  Returns `folder`, its `bytes`, the measured `split`, and `levels`.
 
     With photos, each coarser level is trained before the next one is merged from it, in run folders in FOLDER.training;
     interrupted training resumes.  Raises ConfigError, DataError, OutputError.
@@ -240,7 +240,7 @@ def levels_of_detail(
 
 
 def _open_model(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
-    """Return the model file, None if it has no photos, and its Gaussians with the world filter baked in."""
+    """Return the model file, or None if it has no photos, and its Gaussians with the world filter baked in."""
     run = find_run(model) if scene is None else None
     if scene is None and run is None:
         gaussians = _without_photos(model, plan, device, "has no known photos")

@@ -1,4 +1,4 @@
-"""Partition a scene by a coarse model: cells, views and initial Gaussians of each block, and the manifest."""
+"""Partition a scene by a coarse model into the cells, views, and initial Gaussians of blocks; write the manifest."""
 
 import json
 import logging
@@ -116,7 +116,7 @@ Reason = Literal["inside", "coverage", "best"]
 
 @dataclass(frozen=True)
 class Membership:
-    """The assignment of V views to B blocks."""
+    """The assignment of V training views to B blocks."""
 
     coverage: Floats  # [V, B] fraction of a view's pixels covered by a cell's Gaussians, by blending weight
     inside: NDArray[np.bool_]  # [V, B] whether the camera is in the cell
@@ -137,7 +137,7 @@ class Membership:
         return blocks
 
     def reason(self, view: int, block: int) -> Reason:
-        """Return the reason why a view belongs to a block: `inside`, `coverage`, or otherwise `best`."""
+        """Return the reason why a view belongs to a block: `inside`, `coverage`, or `best`."""
         if self.inside[view, block]:
             return "inside"
         return "coverage" if self.coverage[view, block] > self.min_coverage else "best"
@@ -197,7 +197,7 @@ class Block:
 
     @property
     def growth_box(self) -> Box:
-        """The box in which Gaussians grow, in world coordinates."""
+        """The box in which densification is allowed, in world coordinates."""
         return self.cell.extended(GROWTH).shifted(-self.origin)
 
     def data(self) -> dict[str, Any]:

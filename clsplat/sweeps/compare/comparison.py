@@ -29,7 +29,7 @@ def flatten(settings: dict[str, Any]) -> dict[str, str]:
     """Flatten settings to a dictionary from key path to value as text, in the order of the file.
 
     Key paths contain the names of stages and the types of strategies, as in `optimize.densify.clone.gradient_above`, so
-    that pipelines with different stages can be compared.  The second item with the same name is marked with `#2`.
+    that pipelines with different stages can be compared.  A second item with the same name gets the suffix `#2`.
     """
     flat_settings: dict[str, str] = {}
     for key, value in settings.items():
@@ -100,7 +100,7 @@ class VariantRow:
 
     @property
     def downscale(self) -> str:
-        """The divisor of the image size in training, as text; for several sizes, that of the largest one."""
+        """The divisor of the image size in training, as text; for several training sizes, that of the largest."""
         return f"{self.runs[0].scene.downscale:g}"
 
     def downscales(self, split: str) -> set[str]:
@@ -124,7 +124,7 @@ class RunComparison:
 
     @classmethod
     def read(cls, paths: Sequence[Path]) -> "RunComparison":
-        """Read run folders.  For a matrix folder, read its finished cells.
+        """Read run folders.  A matrix folder is replaced with the folders of its finished cells.
 
         Raises DataError if a folder is missing, unfinished, or damaged, and ConfigError if there is no folder, a folder
         is given twice, or a pipeline.yaml cannot be read.
@@ -244,9 +244,9 @@ def _folders(runs: Sequence[RunFolder]) -> str:
 
 
 def _scene_names(runs: Sequence[RunFolder]) -> list[str]:
-    """Return a name for the scene of each run: its folder and image size.
+    """Return a name for the scene of each run, from its folder and image size.
 
-    All scene settings are appended to names that are not unique.
+    If names are not unique, all scene settings are appended.
     """
     names = []
     for run in runs:

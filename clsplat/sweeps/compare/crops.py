@@ -22,7 +22,7 @@ OVERVIEW_WIDTH = 340  # px
 
 @dataclass(frozen=True)
 class ImageCrop:
-    """A square crop of a view, from its photo and from the render of each run."""
+    """A square crop of a view: the same pixels of its photo and of each run's render."""
 
     view: str  # name
     full_photograph: Image
@@ -49,7 +49,7 @@ class ImageCrop:
 
     @property
     def frame(self) -> dict[str, float]:
-        """The left, top, width, and height of the crop, in percent of the image size."""
+        """The left, top, width, and height of the crop, as percentages of the image size."""
         height, width = self.full_photograph.shape[:2]
         fractions = {
             "left": self.x / width,
@@ -89,7 +89,7 @@ def _file(run: RunFolder, view: View) -> Path:
 
 
 def _crop(view: str, photograph: Image, renders: list[Image]) -> ImageCrop:
-    """Return the crop in which the renders differ most from each other.  Compare a single render with the photo."""
+    """Return the crop in which the renders differ most from each other, or a single render from the photo."""
     images = np.stack(renders if len(renders) > 1 else [*renders, photograph])
     difference = (images.max(axis=0) - images.min(axis=0)).mean(axis=2, dtype=np.float32)
     height, width = photograph.shape[:2]

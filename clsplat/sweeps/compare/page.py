@@ -75,7 +75,7 @@ class MetricTable:
 
 
 def main_table(rows: Sequence[VariantRow]) -> MetricTable:
-    """Return the table of test metrics at the training size, and of costs such as time and memory."""
+    """Return the table of test metrics at the training size, and costs such as time and memory."""
     cost_columns = [
         *_cost(rows, "Gaussians", lambda metrics: metrics.gaussians),
         *_cost(rows, "parameters", lambda metrics: metrics.parameters),
@@ -92,14 +92,14 @@ def _train_seconds(row: VariantRow) -> float:
 
 
 def _cost(rows: Sequence[VariantRow], heading: str, cost: Callable[[RunMetrics], float | None]) -> list[Column]:
-    """Return the column of a cost that only some runs record, as a list; empty if no run recorded it."""
+    """Return the column of a cost as a list, which is empty if no run recorded the cost."""
     optional_values = [[cost(run.metrics) for run in row.runs] for row in rows]
     values = [[value for value in row if value is not None] for row in optional_values]
     return [Column(heading, _cells(values, 0))] if any(values) else []
 
 
 def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
-    """Return the tables of metrics at other sizes and of other views: one per split, so that each fits on the page."""
+    """Return the tables of metrics at other sizes and for other splits: one per split, so that each fits the page."""
     by_split: dict[str, list[Group]] = {}
     for split, downscale in _measured_sizes(rows):
         if (split, downscale) != ("test", rows[0].downscale):
@@ -114,7 +114,7 @@ def downscales(rows: Sequence[VariantRow], split: str) -> list[str]:
 
 
 def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
-    """Return the table of means over scenes, for the variants with runs on all scenes.
+    """Return the table of means over scenes, with the variants that have runs on all scenes.
 
     Returns None if there is no metric that was measured on all scenes.
     """
@@ -132,7 +132,7 @@ def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
 
 
 def differing_settings(variants: Sequence[Variant]) -> dict[str, list[str]]:
-    """Return the settings that differ between variants: by key path, the value of each variant."""
+    """Return the settings that differ between variants, as lists with the value of each variant, by key path."""
     key_paths = differing_keys([variant.settings for variant in variants])
     return {key_path: [variant.settings.get(key_path, "–") for variant in variants] for key_path in key_paths}
 
@@ -159,7 +159,7 @@ def _measured_sizes(rows: Sequence[VariantRow]) -> list[tuple[str, str]]:
 
 
 def _training_size(rows: Sequence[VariantRow]) -> list[Group]:
-    """Return the column group of test metrics at the training size as a list; empty if they were not measured."""
+    """Return the column group of test metrics at the training size as a list, which is empty if there are none."""
     downscale = rows[0].downscale
     return [_group(rows, "test", downscale)] if downscale in downscales(rows, "test") else []
 
@@ -372,7 +372,7 @@ def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
 
 
 def _sizes(scene: SceneSettings) -> list[str]:
-    """Return an explanation of the image sizes as a list of one line; empty if all training images had full size."""
+    """Return a list with a line that explains the image sizes, or an empty list if all runs used the full size."""
     first, *others = (f"1/{downscale:g}" if downscale != 1 else "full size" for downscale in scene.downscales)
     if first == "full size" and not others:
         return []
@@ -380,7 +380,7 @@ def _sizes(scene: SceneSettings) -> list[str]:
 
 
 def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
-    """Return the crops of the first run of each row.  If there are none, also return the reason, else ""."""
+    """Return the crops of the first run of each row, and the reason if there are none, else ""."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
     try:
