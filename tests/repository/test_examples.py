@@ -169,6 +169,16 @@ def test_growth_methods_are_compared_at_equal_length_and_seeds():
     assert all(f"`{name}`" in page or f"`{name.removesuffix('_7k')}`" in page for name in names)
 
 
+def test_captures_are_compared_with_the_same_cameras(folder):
+    for name in "monument stump lund castle plush kitchen brighton kangaroo juice cup fox fountain".split():
+        (folder / "captures" / name).mkdir(parents=True)
+    cells = load_experiment(str(EXAMPLES / "captures.yaml"), ["undistort.long_side=400"]).cells
+    assert len(cells) == 36
+    steps = [[step.model_dump() for step in cell.pipeline.settings.prepare] for cell in cells]
+    assert steps == [steps[0]] * 36
+    assert steps[0][-1]["long_side"] == 400
+
+
 def test_growing_resolution_is_a_pipeline():
     resolution = load(str(EXAMPLES / "growing_resolution.yaml")).settings.stages[1].views.resolution
     assert resolution.points == [[0, 4.0], [500, 2.0], [1000, 1.0]]
