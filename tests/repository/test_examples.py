@@ -27,6 +27,7 @@ from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
+from clsplat.pipeline.yaml_file import read_yaml
 from tests.support.html_page import Page
 
 pytestmark = pytest.mark.slow
@@ -170,8 +171,8 @@ def test_growth_methods_are_compared_at_equal_length_and_seeds():
 
 
 def test_captures_are_compared_with_the_same_cameras(folder):
-    for name in "monument stump lund castle plush kitchen brighton kangaroo juice cup fox fountain".split():
-        (folder / "captures" / name).mkdir(parents=True)
+    for name in read_yaml(EXAMPLES / "captures.yaml").data["matrix"]["scenes"]:
+        (folder / name).mkdir(parents=True)
     cells = load_experiment(str(EXAMPLES / "captures.yaml"), ["undistort.long_side=400"]).cells
     assert len(cells) == 36
     steps = [[step.model_dump() for step in cell.pipeline.settings.prepare] for cell in cells]
