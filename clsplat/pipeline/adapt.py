@@ -56,6 +56,8 @@ class Adaptation(Settings):
 
 
 FEW = 40  # training photos; the hull of fewer silhouettes is too large
+DROPOUT, MAX_DROPOUT = 0.25, 0.2  # probabilities for no photo, decreasing linearly to 0 at FEW photos, and at most
+DROPOUT_UNTIL = 0.43  # fraction of the training steps over which the probability rises
 MIN_FOR_SKY = 12  # training photos; fewer show too little of the background
 MAX_ERROR = 1.0  # px, mean reprojection error at the training size; poses are optimized if it is this large
 POSES_START = 0.15  # fraction of the training steps after which poses are optimized
@@ -63,7 +65,7 @@ POSES_START = 0.15  # fraction of the training steps after which poses are optim
 
 class Photos(Adaptation):
     """Decide settings for folders of photos: a sky if they show one, optimized poses if the reprojection error is a
-    pixel or more, and a random start for fewer than 40 photos with transparency."""
+    pixel or more, and a random start and dropout for fewer than 40 photos with transparency."""
 
     type: Literal["photos"] = "photos"
 
@@ -83,6 +85,11 @@ class Photos(Adaptation):
         )
         yield Decision(key="init.count", value=100_000 if few else 60_000, reason=reason, matters=False)
 
+        probability = min(MAX_DROPOUT, round(DROPOUT * (1 - measures.photographs / FEW), 3))
+        rise = [[0, 0.0], [round(DROPOUT_UNTIL * training.steps), probability]]
+        dropout = {"probability": rise} if few and has_alpha else None
+        reason = f"{count} {'with' if has_alpha else 'without'} transparency: {'' if dropout else 'no '}dropout"
+        yield Decision(key="optimize.modules.dropout", value=dropout, reason=reason, matters=dropout is not None)
         random = {"when": "transparent"} if few else None
         reason = f"{count}: {'random' if few else 'no random'} colors behind transparent pixels"
         yield Decision(key="optimize.modules.random_background", value=random, reason=reason, matters=few and has_alpha)

@@ -153,4 +153,5 @@ def test_impossible_decision_is_refused_in_one_sentence(adapt, complaint):
 def test_transparent_photos_have_a_reason(tiny_scene, tmp_path):
     text = describe(load("photos", [f"scene.path='{tiny_scene}'"]), RunState.read(tmp_path / "run"), None, "new")
     assert "random colors behind transparent pixels" in text
+    assert "8 training photos with transparency: dropout" in text
     assert "silhouettes" not in text, "the dataset has points"
