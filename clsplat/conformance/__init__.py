@@ -1,1 +1,1 @@
-"""Check that a device computes correctly and measure its speed, with a float64 reference, doctor and bench."""
+"""Check the results of a device against a float64 reference (doctor), and measure its speed (bench)."""

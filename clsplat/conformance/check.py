@@ -21,7 +21,7 @@ LOSS_GRADIENT = 2e-4  # relative to the largest value of the gradient
 
 @dataclass(frozen=True)
 class Deviation:
-    """The result of one comparison with the reference, and its bound."""
+    """The deviation in one comparison with the reference, and the bound on it."""
 
     kernel: str
     label: str  # the values that were compared
@@ -48,14 +48,14 @@ def relative_error(value: NDArray[Any], expected: NDArray[Any]) -> float:
 
 
 def compare(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float) -> Deviation:
-    """Compare by norm.  Use this for gradients, whose small components suffer from cancellation."""
+    """Compare arrays by norm.  Use this for gradients, whose small components suffer from cancellation."""
     return Deviation(kernel, label, relative_error(value, expected), bound)
 
 
 def compare_max(
     kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any], bound: float, floor: float = 0.0
 ) -> Deviation:
-    """Compare value by value.  The deviation is the largest |value - expected| / (|expected| + floor)."""
+    """Compare arrays elementwise.  The deviation is the largest |value - expected| / (|expected| + floor)."""
     if value.size == 0:
         return Deviation(kernel, label, 0.0, bound)
     difference, scale = np.abs(np.subtract(value, expected, dtype=np.float64)), np.abs(expected) + floor
@@ -74,9 +74,9 @@ def count_true(kernel: str, label: str, mask: NDArray[Any], allowed: float = 0) 
 
 
 def check_image(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any]) -> Iterator[Deviation]:
-    """Compare images, [C, H, W].  A few pixels may differ more, where a splat crosses a threshold.
+    """Compare images, [C, H, W].  A few pixels, where a splat crosses a threshold, may differ more.
 
-    Such a splat changes a pixel by up to 1/255 of its color, and colors are at most 3.
+    Such a splat changes a pixel by at most 1/255 of the splat's color, and colors are at most 3.
     """
     difference = np.abs(value - expected).max(axis=0)
     yield Deviation(kernel, f"{label}: largest difference", float(difference.max()), 1.5e-2)

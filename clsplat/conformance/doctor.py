@@ -30,7 +30,7 @@ REMEDY = f"update the device's driver or use another device (`clsplat devices` l
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a device is usable, and how."""
+    """The verdict on a device: whether it is usable, a sentence about it, and advice."""
 
     usable: bool
     text: str
@@ -111,12 +111,12 @@ class DeviceReport:
 
     @property
     def failures(self) -> dict[str, list[str]]:
-        """A sentence for each failure, by schedule.  The key of memory and speed is ''."""
+        """A sentence for each failure, by schedule; failures of memory and speed have the key ''."""
         by_schedule = {**self.schedules, "": self.once}
         return {name: [text for result in results for text in result.failures] for name, results in by_schedule.items()}
 
     def note(self, name: str) -> dict[str, Any] | None:
-        """Return the data of the note with a name, or None if no check reported it."""
+        """Return the data of the note named `name`, or None if no check reported it."""
         for result in (*self.once, *self.schedules.get(self.default, [])):
             for note in result.notes:
                 if note.name == name:
@@ -158,7 +158,7 @@ class DeviceReport:
         return f"wrote and read {sizes}; {note['stopped']}"
 
     def speed(self) -> str:
-        """Return the time of a step next to the device's peaks, as a sentence; '' if it was not measured."""
+        """Return the time of a step and the peaks of the device, as a sentence; '' if they were not measured."""
         note = self.note("speed")
         if note is None:
             return ""
@@ -229,7 +229,7 @@ def examine(device: str | Device | None = None) -> DeviceReport:
 
 
 def _is_due(schedule: str, report: DeviceReport) -> bool:
-    """Return whether to check a schedule: `simt` always, `wide` if it is the default or if a CPU fails with `simt`.
+    """Return whether to check a schedule: `simt` always, `wide` if it is the default or a CPU fails with `simt`.
 
     Other devices do not benefit from `wide`, and some compilers need many minutes for its vectors.
     """

@@ -1,4 +1,4 @@
-"""Compare the kernels of a training step with the reference, once per device, driver and kernel version."""
+"""Compare the kernels of a training step with the reference, once per device, driver, and kernel version."""
 
 import hashlib
 import logging
@@ -38,7 +38,7 @@ def open_verified(device: str | Device | None, schedule: Schedule = "auto", sort
 
 
 def ensure_correct(device: Device, sort: Sort = "auto") -> None:
-    """Compare the essential kernels with the reference, on the first use of a device, driver and kernel version.
+    """Compare the essential kernels with the reference, on the first use of a device, driver, and kernel version.
 
     The checks run in a child process, so that the state of the open device does not change.  The bitonic sort is
     checked if the run may choose it.  Raises DeviceError if the results of the device are wrong, and MemoryLimitError
@@ -80,7 +80,7 @@ def forget(info: DeviceInfo, schedule: FixedSchedule) -> None:
 def _record_file(info: DeviceInfo, schedule: FixedSchedule, sort: str) -> Path:
     """Return the path of a record.
 
-    Its name is a hash of all that affects the results: checks, device, driver, kernels, and build options.
+    Its name is a hash of everything that affects the results: checks, device, driver, kernels, and build options.
     """
     checks = (__version__, _hash_checks())
     device = (info.platform, info.name, info.driver, version("pyopencl"))

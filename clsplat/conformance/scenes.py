@@ -23,7 +23,7 @@ EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.
 
 @dataclass(frozen=True)
 class Case:
-    """N Gaussians in front of one camera, in float32, so that kernels and reference use the same values."""
+    """N Gaussians in front of a camera.  Values are float32, so that kernels and reference use the same ones."""
 
     parameters: dict[str, NDArray[Any]]  # [N, components] float32
     view: View
@@ -137,7 +137,7 @@ def safe_case(
     change: Callable[[dict[str, NDArray[Any]]], None] = lambda parameters: None,
     **changes: Any,
 ) -> Case:
-    """Return a random case in which no pixel is within `margin` of a threshold, so float32 and float64 blend alike.
+    """Return a random case with no pixel within `margin` of a threshold, so that float32 and float64 blend alike.
 
     change: function that edits the parameters of each candidate in place.
     """

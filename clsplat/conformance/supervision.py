@@ -1,4 +1,4 @@
-"""Run checks in child processes, and continue after one that crashes or hangs."""
+"""Run checks in child processes, and continue after a check that crashes or hangs."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Read .glb and .gltf files with KHR_gaussian_splatting; write .glb, and OpenUSD as text.
+"""Read .glb and .gltf files with KHR_gaussian_splatting, and write .glb and text OpenUSD files.
 
     POSITION 3 · ROTATION x y z w, unit · SCALE 3, linear · OPACITY in [0, 1] · SH_DEGREE_l_COEF_m 3, in the order and
     with the signs of f_rest · COLOR_0 r g b a, linear, for viewers without the extension
@@ -65,7 +65,7 @@ MAX_TEXT = 1 << 29  # bytes of a .gltf
 class Gltf:
     """The Gaussian primitives of a file.
 
-    Raises DataError if there are none; a damaged tree raises built-in errors, such as KeyError.
+    Raises DataError if there are none, and built-in errors such as KeyError if the tree is damaged.
     """
 
     def __init__(self, path: Path, tree: dict[str, Any], binary: bytes | None) -> None:
@@ -144,7 +144,7 @@ class Gltf:
         return flip_axes(part, axes[0])
 
     def _attributes(self, names: dict[str, Any]) -> Parameters:
-        """Return the Gaussians of the attributes of a primitive, in the axes of glTF."""
+        """Return the Gaussians stored in the attributes of a primitive, in the axes of glTF."""
 
         def table(name: str, width: int) -> NDArray[np.float32]:
             if name not in names:
@@ -310,7 +310,7 @@ def _to_srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _index(value: Any) -> int:
-    """Return an index, size, or offset.  Raises ValueError if it is not an integer from 0."""
+    """Return an index, size, or offset unchanged.  Raises ValueError unless it is an integer of at least 0."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 40:
         raise ValueError(f"expected a whole number from 0, got {quote(value)}")
     return value
@@ -330,7 +330,7 @@ def looks_like_gltf(data: bytes) -> bool:
 
 
 def gltf_files(path: Path) -> list[Path]:
-    """Return a .gltf file and the files of its buffers; only the .gltf file if it is damaged."""
+    """Return the paths of a .gltf file and of its buffers; only the .gltf file if it is damaged."""
     try:
         uris = [unquote(buffer["uri"]) for buffer in read_json(path)["buffers"]]
         return [path, *(path.parent / uri for uri in uris if is_inside(uri) and not uri.startswith("data:"))]

@@ -62,7 +62,7 @@ def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask of the levels that do not round to a byte, with the shape of `levels`."""
+    """Return a mask, with the shape of `levels`, of the levels that do not round to a value of a byte."""
     return (levels < -0.5) | (levels > 255.5)
 
 
@@ -116,7 +116,7 @@ def decode(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int)
 
 
 def _rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Decode pixels, [n, 4].  An image in which alpha is 255 everywhere may have no alpha channel."""
+    """Decode pixels, [n, 4].  An image without an alpha channel gets an alpha of 255."""
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8 or image.ndim != 3:
         return np.zeros((0, 4), np.uint8)

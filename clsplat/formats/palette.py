@@ -146,7 +146,10 @@ def _nearest_vectors(
 
 
 def _sample_rows(count: int, max_rows: int, weights: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return ascending rows for training a palette, evenly spaced in total weight, or in number without weights."""
+    """Return the rows to train a palette on, in ascending order, evenly spaced in cumulative weight.
+
+    If all weights are 0, the rows are evenly spaced.
+    """
     max_rows = min(count, max_rows)
     if not weights.any():
         return np.linspace(0, count - 1, max_rows).astype(np.int64)
@@ -174,7 +177,7 @@ def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray
 
 
 def robust_max(values: NDArray[np.float32]) -> np.float32:
-    """Return the absolute value that only a fraction TAIL of the values exceeds, or 0 if there are no values."""
+    """Return the quantile 1 - TAIL of the absolute values, or 0 if there are no values."""
     sizes = np.abs(values).ravel()
     index = min(int((1 - TAIL) * sizes.size), sizes.size - 1)
     return np.float32(np.partition(sizes, index)[index] if sizes.size else 0)

@@ -1,4 +1,4 @@
-"""Read and write the PLY files of 3DGS; properties are written in its order, and read in any order.
+"""Read and write the PLY files of 3DGS.  Properties are written in the order of 3DGS, and read in any order.
 
     x y z nx ny nz f_dc_0..2 f_rest_0..(3(K-1)-1) opacity scale_0..2 rot_0..3    float32, before activation
 
@@ -161,7 +161,7 @@ def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
 def format_ply_header(comments: Iterable[str], **elements: tuple[int, Iterable[str]]) -> bytes:
     """Return the header of a binary little-endian file.
 
-    elements: by name, the number of rows and the properties, such as `float x`, in order.
+    elements: the number of rows and the properties, such as `float x`, of each element, by name.
     """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
     for name, (count, properties) in elements.items():
@@ -193,7 +193,7 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
 
 
 def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
-    """Return the sections of a binary file by name, up to an element with a list.  Of equal names, the first counts."""
+    """Return the sections of a binary file by name, up to an element with a list.  The first of equal names counts."""
     sections: dict[str, Section] = {}
     for element in elements:
         if element.has_list:
@@ -266,7 +266,7 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
 
 
 def _encode_rows(parameters: Parameters) -> bytes:
-    """Return the rows of a file as bytes."""
+    """Encode parameters as the rows of a file."""
     count, rest = parameters["sh_rest"].shape
     means = parameters["means"]
     blocks = [

@@ -70,7 +70,7 @@ SLACK = 1 << 16  # bytes or px allowed in addition to the required ones
 
 
 def sog_folder_files(path: Path) -> list[Path]:
-    """Return a meta.json and those of its images that exist; only the meta.json if it is damaged."""
+    """Return the paths of a meta.json and of its existing images; only the meta.json if it is damaged."""
     try:
         meta = read_json(path, limit=MAX_META)
     except DataError:
@@ -90,7 +90,7 @@ def is_sibling(name: str) -> bool:
 class Files:
     """The files of a SOG, each of which is read only once.
 
-    They are members of a ZIP, in any of its folders, or files in the folder of a meta.json.
+    They are members of a ZIP, in any folder, or files next to a meta.json.
     """
 
     def __init__(self, path: Path, archive: zipfile.ZipFile | None = None, size: int = MAX_FILE) -> None:
@@ -152,7 +152,7 @@ LARGEST_W = 252  # alpha of a quaternion whose largest component is w; 253 to 25
 
 
 def looks_like_sog(data: bytes) -> bool:
-    """Return whether data starts like a ZIP or like the meta.json of a SOG folder."""
+    """Return whether the first bytes are those of a ZIP or of the meta.json of a SOG folder."""
     return data.startswith(b"PK\3\4") or (data.lstrip()[:1] == b"{" and b'"means"' in data)
 
 
@@ -256,7 +256,7 @@ class _Sog:
         return WIDTHS[width // PER_ROW]
 
     def _decode(self, name: str, levels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Decode the bytes of a part, [N, c], to values: codebook indices, or, in version 1, 255ths of its range."""
+        """Decode the bytes of a part, [N, c], which are codebook indices, or in version 1 fractions of a range."""
         if not self.is_version_1:
             entries = self._read_numbers(f"{name}.codebook", self._part(name).get("codebook"), 256)
             return np.asarray(entries.astype(np.float32)[levels])
@@ -268,7 +268,7 @@ class _Sog:
         return (minimum + levels / 255.0 * (maximum - minimum)).astype(np.float32)
 
     def _pixels(self, name: str, index: int) -> NDArray[np.uint8]:
-        """Return the pixels of a part's image, one per splat, [count, 4]."""
+        """Return the pixels of an image of a part, one pixel per splat, [count, 4]."""
         images = self.images[name]
         if index >= len(images):
             raise DataError(
@@ -432,7 +432,7 @@ class Harmonics:
         refine: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
-        """Fit a small palette to SH coefficients, [N, c].  After training with its `values`, saving loses nothing.
+        """Fit a small palette to SH coefficients, [N, c].  Training with its `values` makes saving lossless.
 
         weights: of the squared errors, [N].  refine: returns a better palette, [E, c], and the label of each splat.
         step: multiple to which codebook values are rounded if at most 256 of them remain.
@@ -452,7 +452,7 @@ class Harmonics:
 
     @property
     def values(self) -> NDArray[np.float32]:
-        """The SH coefficients as a reader decodes them, [N, c]."""
+        """The SH coefficients that a reader decodes, [N, c]."""
         return self.codebook.astype(np.float32)[self.palette][self.labels]
 
 
@@ -462,7 +462,7 @@ def _training_entries(count: int, quality: Quality) -> int:
 
 
 def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
-    """Round the tables, and return them with a palette of the SH, which is None without SH bands above 0.
+    """Round the tables; return them and a palette of the SH, or None if there are no SH bands above 0.
 
     If the SH already form a palette, training has rounded all tables, and they stay unchanged.
     Quality `high` rounds tables only to the precision of the format.
@@ -502,7 +502,7 @@ def _round(number: float, rounding: str = ROUND_HALF_EVEN) -> float:
 
 
 def _zip(images: dict[str, bytes]) -> bytes:
-    """Return the bytes of an uncompressed ZIP; they depend on neither the time nor the operating system."""
+    """Return the bytes of an uncompressed ZIP, which depend on neither the time nor the operating system."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in images.items():

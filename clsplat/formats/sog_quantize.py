@@ -35,7 +35,7 @@ def round_means(
 ) -> NDArray[np.float32]:
     """Round positions, [N, 3], with a step for each Gaussian, about `fraction` of its size if its weight is the median.
 
-    The step is proportional to 1 / sqrt(weight), and a power-of-two number of SOG levels.
+    The step is proportional to 1 / sqrt(weight), rounded to a power-of-two number of SOG levels.
     """
     levels, low, level = _levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
@@ -66,7 +66,7 @@ def _positions(logarithms: NDArray[np.float64]) -> NDArray[np.float32]:
 def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Round quaternions, [N, 4], to every `step`-th level of SOG; also return log scales, [N, 3], permuted to match.
 
-    24 pairs of rotation and scales, which permute and flip the axes, represent the same Gaussian.  The pair with the
+    Axes can be permuted and flipped, so 24 pairs of rotation and scales represent the same Gaussian.  The pair with the
     smallest rotation angle is used: w is then the largest component, and the others are small.
     """
     q, rows = unit(quats), np.arange(len(quats))
@@ -95,19 +95,19 @@ ROWS = 1 << 15  # rows rounded at once
 
 
 def quantization_steps(log_weights: NDArray[np.float64], median: float, max_step: float) -> NDArray[np.float32]:
-    """Return power-of-two steps, [N], from 1 to `max_step`.  Gaussians of median weight get about `median`."""
+    """Return power-of-two steps, [N], from 1 to `max_step`.  The step for the median weight is about `median`."""
     exponents = np.rint(np.log2(median) - log_weights / 2)
     return np.asarray(np.exp2(np.clip(exponents, 0, np.log2(max_step))), np.float32)
 
 
 def scaled_step(rest: Floats, step: float, max_step: float) -> float:
-    """Scale `step`, which is for SH with an RMS of TYPICAL_RMS, to the RMS of `rest`.  Return at most `max_step`."""
+    """Convert a step for SH with an RMS of TYPICAL_RMS to a step, at most `max_step`, for the RMS of `rest`."""
     size = float(np.sqrt(np.square(np.clip(rest, -1, 1), dtype=np.float64).mean())) if rest.size else 0.0
     return min(max_step, step * max(size / TYPICAL_RMS, 1e-3))
 
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
-    """Return the metric of visible errors of SH, [N, 3 K]: a matrix, [K, K], with a trace of about K.
+    """Return the quadratic form of visible errors of SH, [N, 3 K]: a matrix, [K, K], with a trace of about K.
 
     The result is bit-identical for any number of threads.
     """

@@ -44,7 +44,7 @@ EXPECTED = "a .splat file with 32 bytes per splat"
 
 
 def looks_like_splat(data: bytes, size: int) -> bool:
-    """Return whether the first bytes of a file of `size` bytes can be splats; the format has no magic number."""
+    """Return whether a file of `size` bytes may contain splats, given its first bytes; it has no magic number."""
     count = len(data) // ROW.itemsize
     if not count or size % ROW.itemsize or data.isascii():
         return False
@@ -140,12 +140,12 @@ class SplatSection:
         return np.dtype(fields)
 
     def sizes(self, level: int) -> tuple[int, int, int]:
-        """Return the sizes of the partial buckets' counts, of the buckets, and of the splats, bytes."""
+        """Return the sizes in bytes of the counts of partial buckets, of the buckets, and of the splats."""
         return 4 * self.partial, self.bucket_bytes * self.buckets, self.row(level).itemsize * self.rows
 
 
 def looks_like_ksplat(data: bytes, size: int) -> bool:
-    """Return whether the first bytes of a file of `size` bytes can be a header; the format has no magic number."""
+    """Return whether a file of `size` bytes may start with a header, given its first bytes; it has no magic number."""
     if size < HEADER + SECTION or len(data) < HEADER or data[0] != 0 or not 1 <= data[1] < 32:
         return False
     max_sections, sections, _, splats, level = struct.unpack_from("<4IH", data, 4)

@@ -2,8 +2,8 @@
 
     means [3] scene units · quats [4] (w, x, y, z), unnormalized · log_scales [3] log of scene units
     logit_opacity [1] · sh_base [3] band 0 · sh_rest [(K-1)*3] the other bands, coefficient-major
-    filter_variance [1] scene units², the world filter; only in our own PLY
-    motion [5 or more], for moving Gaussians; only in our own PLY
+    filter_variance [1] scene units², the world filter; only in clsplat's PLY
+    motion [5 or more], for moving Gaussians; only in clsplat's PLY
 
 Axes are those of a 3DGS PLY: x right, y down, z forward.
 """
@@ -40,7 +40,7 @@ def is_timestamp(time: float) -> bool:
 
 
 def motion_width(degree: int, has_turn: bool) -> int:
-    """Return the number of columns of a motion table.  degree: of its polynomials, 1 to 3; has_turn: with rotations."""
+    """Return the number of columns of a motion table.  degree: of its polynomials, 1 to 3; has_turn: has rotations."""
     return 2 + 3 * degree + TURN * has_turn
 
 
@@ -69,7 +69,7 @@ def motion_columns(width: int) -> tuple[str, ...]:
 
 
 def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
-    """Return the motion columns among a file's properties: () if there are none, None if the table is incomplete."""
+    """Return the motion columns in a file's properties; () if there are none, and None if some are missing."""
     columns = {column for width in WIDTHS for column in motion_columns(width)} & set(names)
     return next((table for table in ((), *map(motion_columns, WIDTHS)) if set(table) == columns), None)
 
@@ -194,7 +194,7 @@ def logs(scales: Floats) -> NDArray[np.float32]:
 
 
 def unit(quats: Floats) -> NDArray[np.float64]:
-    """Return unit quaternions [N, 4]; those of length 0 become (1, 0, 0, 0)."""
+    """Normalize quaternions, [N, 4]; quaternions of length 0 become (1, 0, 0, 0)."""
     doubles = quats.astype(np.float64)
     length = np.linalg.norm(doubles, axis=1, keepdims=True)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -225,7 +225,7 @@ def _signs(parameters: Parameters, axes: Sequence[float]) -> Parameters:
 def transform(
     parameters: Parameters, scale: float, rotation: NDArray[np.float64], translation: Any
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the tables that the transform x -> scale · rotation x + translation changes.
+    """Apply the transform x -> scale · rotation x + translation, and return the changed tables.
 
     Raises ValueError for a matrix that is not a rotation, and for a scale that is not positive.
     """
@@ -316,7 +316,7 @@ def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 
 def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
-    """Refuse, drop, or keep Gaussians with NaN or infinity, as `options.not_finite` says.
+    """Reject, drop, or keep Gaussians with NaN or infinity, depending on `options.not_finite`.
 
     "drop" also drops Gaussians with values that are too large, or with quaternions of length 0.  Raises DataError.
     """

@@ -406,7 +406,7 @@ class _Gzip:
         self.path, self.data, self.file, self.stream = path, data, io.BytesIO(data), zlib.decompressobj(31)
 
     def read(self, size: int) -> bytes:
-        """Return the next `size` decompressed bytes, or fewer at the end."""
+        """Return the next `size` decompressed bytes, or less at the end of the content."""
         data = bytearray()
         while len(data) < size and (not self.stream.eof or self._start_member()):
             packed = self.stream.unconsumed_tail or self.file.read(BLOCK)
@@ -468,7 +468,7 @@ def _decode_version_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, s
 
 
 def _max_decoded_size(data: bytes) -> int:
-    """Return the largest accepted number of plane bytes that a compressed file decodes to."""
+    """Return the accepted maximum size, in bytes, of the decompressed planes of a file."""
     return max(len(data) * RATIO, MIN_LIMIT)
 
 
@@ -483,7 +483,7 @@ def _check_size(path: Path, header: SpzHeader, limit: int) -> None:
 
 
 def _read_axes(path: Path, read: Callable[[int], bytes]) -> str:
-    """Return the declared axes, or ''; skip other extensions, like Niantic's library.  Raises DataError."""
+    """Return the declared axes, or ''.  Other extensions are skipped, as in Niantic's library.  Raises DataError."""
     axes = ""
     while len(record := read(8)) == 8:
         kind, length = struct.unpack("<2I", record)

@@ -2,7 +2,7 @@
 
     lod-meta.json   version 1, count of all levels, counts by level, lodLevels, filenames, tree, and an environment
     a node          bound {min, max}, and two children; a leaf has lods: a file, an offset and a count by level
-    L_i/meta.json   a SOG folder of level L with consecutive runs of leaves; level 0 is the finest
+    L_i/meta.json   a SOG folder of level L, with the splats of one leaf after another; level 0 is the finest
 
 A viewer chooses the level of each leaf by its distance.  Reading returns the finest level.
 """
@@ -74,7 +74,7 @@ def find_level_faults(path: Path) -> list[str]:
 
 
 def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
-    """Return an error message for each missing or damaged file.  runs: the row ranges of its leaves, by file number."""
+    """Return an error message for each missing or damaged file.  runs: row ranges of leaves, by file number."""
     faults = []
     for file, leaves in sorted(runs.items()):
         try:
@@ -113,7 +113,7 @@ def _meta(path: Path) -> dict[str, Any]:
 
 
 def _check_name(path: Path, name: Any) -> str:
-    """Validate the name of a meta.json below the folder."""
+    """Return the name of a meta.json below the folder unchanged.  Raises DataError if it is invalid."""
     if not isinstance(name, str) or not _is_meta_below(name):
         raise DataError(f"{path}: names {quote(name)}; expected a {META} in a folder below; export it again")
     return name
@@ -125,7 +125,7 @@ def _is_meta_below(name: str) -> bool:
 
 
 def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
-    """Return the runs of the leaves in each file, for each level.  Raises DataError for a damaged leaf."""
+    """Return the row ranges of the leaves in each file, for each level.  Raises DataError for a damaged leaf."""
     levels: list[Runs] = [{} for _ in meta["counts"]]
     numbers = {str(level): level for level in range(len(levels))}
     for leaf in _leaves(path, meta.get("tree")):
@@ -151,7 +151,7 @@ def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> 
 
 
 def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
-    """Yield the runs of each leaf, by level."""
+    """Yield the row ranges of each leaf, by level."""
     pending = [tree]
     while pending:
         node = pending.pop()
@@ -172,7 +172,7 @@ def _parse_integer(path: Path, key: str, run: Any) -> int:
 
 
 def _read_splats(path: Path, name: str, runs: list[Run]) -> SplatFile:
-    """Return the splats of a file that belong to leaves.  runs: in ascending order."""
+    """Return the splats of a file that belong to leaves.  runs: row ranges in ascending order."""
     splats = read_sog(path.parent / name)
     rows, end = [np.arange(0)], 0
     for offset, count in runs:
@@ -204,7 +204,7 @@ class LeafLimits:
 
 @dataclass(frozen=True)
 class Node:
-    """A box with two children, or a leaf with the rows of its splats by level, each along a Morton curve."""
+    """A box with two children, or a leaf with the rows of its splats by level, in Morton order."""
 
     low: Floats  # [3] scene units
     high: Floats
@@ -220,7 +220,7 @@ class Node:
 
 
 def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
-    """Build the tree of all levels.  The levels start with the finest, and none is empty."""
+    """Build the tree of all levels, which start with the finest and are not empty."""
     means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
     reach, max_extent = np.concatenate([half_boxes(level) for level in levels]), limits.extent * typical_size(means)
     starts = np.cumsum([0, *(len(level["means"]) for level in levels)])
@@ -289,7 +289,7 @@ def write_lod(
 
 @dataclass
 class _Files:
-    """The files of all levels; leaves are added to a file until it has more than `splats` splats."""
+    """The files of all levels.  Leaves are added to a file until it has more than `splats` splats."""
 
     splats: int
     rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: the level, and runs of its rows

@@ -1,4 +1,4 @@
-"""List the file formats; reading detects the format by content, and writing selects it by file name."""
+"""List the file formats.  Reading detects the format by content, and writing selects it by file name."""
 
 import logging
 import os
@@ -74,7 +74,7 @@ class Codec:
 
 
 def model_file(path: Path) -> Path:
-    """Return the main file of a model: in a folder, its meta.json or lod-meta.json."""
+    """Return the main file of a model, which in a folder is its meta.json or lod-meta.json."""
     files = (path / name for name in (META, LOD_META)) if path.is_dir() else ()
     return next(filter(Path.is_file, files), path)
 
@@ -183,7 +183,7 @@ CODECS = (
 
 
 def endings(reads: bool = False) -> list[str]:
-    """Return the file name endings of the formats that can be written, or with `reads`, of those that can be read."""
+    """Return the file name endings of the formats that can be written, or with `reads`, that can be read."""
     return [end for codec in CODECS if (codec.read if reads else codec.write) for end in codec.endings]
 
 
@@ -265,7 +265,7 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
 
 
 def warn_about_losses(path: Path, splats: SplatFile) -> None:
-    """Warn if the format of a file name does not store the mip mark, the rendering settings, or the origin."""
+    """Warn if the format of a file name cannot store the mip mark, the rendering settings, or the origin."""
     codec = writing_format(path)
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning(

@@ -98,7 +98,7 @@ def check_unused(out: Path) -> None:
 
 
 def _describe_offloading(pipeline: Pipeline, run: Run) -> list[str]:
-    """Return the memory plan as a list of one line; empty unless the spherical harmonics are offloaded to the host."""
+    """Return a list with a line on memory if the spherical harmonics are offloaded to the host, else an empty list."""
     init_stage = next((stage for stage in pipeline.stages if isinstance(stage, Init)), None)
     if init_stage is None:
         return []
@@ -111,7 +111,7 @@ def _describe_offloading(pipeline: Pipeline, run: Run) -> list[str]:
 
 
 def _has_work(stage: Stage, run: Run | None) -> bool:
-    """Return whether a stage has any work.  Evaluation and rendering have none if their split has no views."""
+    """Return whether a stage does anything.  Evaluation and rendering do nothing if their split has no views."""
     return not (isinstance(stage, Evaluate | Render) and run) or bool(run.original.split(stage.split))
 
 

@@ -33,7 +33,7 @@ MAX_PER_PIXEL = 1.0  # Gaussians per pixel of an image, if no setting limits the
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimated time of one part of a run, with an explanation."""
+    """The estimated time of a part of a run, with an explanation."""
 
     name: str
     seconds: tuple[float, float]  # minimum and maximum

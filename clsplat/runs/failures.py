@@ -21,7 +21,7 @@ class Failures(dict[str, ClsplatError]):
 
     @contextmanager
     def recording(self, name: str) -> Iterator[None]:
-        """Record an error of the block as the failure of a part, instead of raising it.  Raises Interrupted."""
+        """Record an error in the block as the failure of a part, instead of raising it.  Raises Interrupted."""
         try:
             yield
         except Interrupted:
@@ -48,7 +48,7 @@ class Failures(dict[str, ClsplatError]):
 
 @contextmanager
 def recording_failures(status: StatusFile, reraise: bool = False) -> Iterator[None]:
-    """Write any failure of the block to status.json, and raise it as a ClsplatError.
+    """Write any failure in the block to status.json, and raise it as a ClsplatError.
 
     reraise: whether to raise the original exception instead.
     """

@@ -58,7 +58,7 @@ def read(file: Path) -> AnyModel:
 
 
 def make_painter(host_model: AnyModel, device: Device, background: Background) -> Painter:
-    """Return a painter for a model on a device.  background: behind Gaussians; a field file contains its background."""
+    """Return a painter for a model on a device.  background: the color behind Gaussians; field files contain theirs."""
     if isinstance(host_model, FieldModel):
         return host_model.upload(device)
     return SplatPainter(Rasterizer(device), host_model.upload(device), Photographs(device, background).background)
@@ -140,7 +140,7 @@ def require_model(path: Path) -> None:
 
 
 def _missing_model_error(folder: Path, name: str = MODEL) -> DataError:
-    """Return the error for a folder without a model; its remedy depends on whether the folder is a run or photos."""
+    """Return the error for a folder without a model.  The remedy depends on whether it contains a run or photos."""
     if _has_field(folder):
         return DataError(f"{folder}: its field file is missing; run its pipeline again with the stage export_field")
     if has_pipeline(folder):
@@ -160,7 +160,7 @@ def refuse_field(path: Path) -> None:
 
 
 def field_error(path: Path) -> DataError:
-    """Return the error for a field where Gaussians are expected."""
+    """Return the error for a field file that is used where Gaussians are expected."""
     remedy = "use `clsplat render`, after the stage export_field"
     return DataError(f"{path}: is a field, which has a network instead of Gaussians; {remedy}")
 
@@ -313,7 +313,7 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
 
 
 def _read_record(out: Path) -> dict[str, bool]:
-    """Return the names of earlier renders in a folder, each with whether it is a frame of a video."""
+    """Read the record of earlier renders in a folder: for each file name, whether it is a frame of a video."""
     try:
         record = read_json(out / RECORD)
     except DataError:
@@ -403,7 +403,7 @@ class ModelFile:
 def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:
     """Write cameras in the format of another program; return the paths of the files.
 
-    scene: a dataset folder, a `Scene`, or a run folder, whose optimized cameras are written.  Raises ClsplatError.
+    scene: a dataset folder, a `Scene`, or a run folder, to write its optimized cameras.  Raises ClsplatError.
     """
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; expected a folder to write into")

@@ -131,7 +131,7 @@ def open_run(
 def count_listener(status: StatusFile) -> Listener:
     """Return a listener that writes the progress of the preparation to `status`.
 
-    The remaining time is written only while the scene is read, because earlier the time of the next steps is unknown.
+    The remaining time is written only while the scene is read, since before that the time of later steps is unknown.
     """
 
     def note_count(unit: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
@@ -193,7 +193,7 @@ def _check_split(pipeline: Pipeline, planned_steps: Sequence[PlannedStep], out: 
 
 
 def expected_measures(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
-    """Return the measures that are known before the preparation; None without names.
+    """Return the measures that are known before the preparation, or None if there are no photos to prepare.
 
     Only the number of training and validation photos is known, and only if all of them get a camera.  Raises DataError
     if the split rejects the photos.

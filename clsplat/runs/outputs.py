@@ -30,7 +30,7 @@ from clsplat.training.stage import Training
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
-    """Write metrics.json: the results of a run, and the first output of the last stage of each name."""
+    """Write the results of a run, and for each stage name the first output of the last such stage, to metrics.json."""
     training = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
     seconds = {
         **run.status.seconds,
@@ -64,7 +64,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
 
 
 def previous_sums(pipeline: Pipeline, run: Run) -> dict[str, str]:
-    """Return the SHA-256, by path in the folder, of the files of a finished run that no remaining stage rewrites.
+    """Return the SHA-256, by path in the run folder, of a finished run's files that no remaining stage rewrites.
 
     Until the run ends again, a change to these files is damage.  The records, and the files of a training stage that
     continues, are included only if they are damaged.
@@ -152,7 +152,7 @@ def require_inside(out: Path, files: Sequence[Path]) -> None:
 
 
 def _is_lock(file: Path) -> bool:
-    """Return whether a file is a run.lock, even if its process did not finish writing it."""
+    """Return whether a file is a run.lock, even if its process stopped before it had written all of it."""
     start = b'{"process": '
     return file.is_file() and start.startswith(read_file(file)[: len(start)])
 

@@ -35,7 +35,7 @@ class Averages(BaseModel):
 
     @property
     def color_views(self) -> int:
-        """The number of views over which `psnr_color` is averaged."""
+        """The number of views in the mean of `psnr_color`."""
         return self.views if self.psnr_color_views is None else self.psnr_color_views
 
     def figure(self, metric: str) -> float | None:
@@ -109,7 +109,7 @@ class RunFolder:
         return Records(self.path).read()
 
     def points(self, kind: str, figure: str, **conditions: Any) -> Points:
-        """Return the points (step, figure) of all records of a kind, such as `train`, that match the conditions.
+        """Return points (step, figure) from all records of a kind, such as `train`, that match the conditions.
 
         conditions: values that a record must have, such as split="test".
         """

@@ -107,7 +107,7 @@ def clear(status: StatusFile) -> None:
 
 
 def _has_own_pipeline(state: RunState) -> bool:
-    """Return whether a run or a matrix wrote the pipeline.yaml of a folder; True if there is none."""
+    """Return whether a run or a matrix wrote the pipeline.yaml of a folder; True if there is no such file."""
     out = state.out
     if PIPELINE not in state.names or STATUS in state.names or state.checkpoints:
         return True

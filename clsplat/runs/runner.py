@@ -35,7 +35,7 @@ WITHOUT_VALIDATION = {"keep": "last", "patience": None, "refit": False}
 
 
 def is_refit_due(run: Run) -> bool:
-    """Return whether validation has chosen the number of steps, but the refit has not started yet."""
+    """Return whether validation has chosen the number of steps and the refit has not started yet."""
     return run.best is not None and run.best.refit == "due"
 
 
@@ -71,7 +71,7 @@ def with_refit_steps(pipeline: Pipeline, run: Run) -> Pipeline:
 
 
 def _with_growth_end(stage: Densify, best: Best) -> Densify:
-    """Return a stage whose growth ends at the step at which it ended in the first training."""
+    """Return a stage whose growth ends at the same step as in the first training."""
     end_steps = [step for step in (stage.grow_until, best.growth_ended if stage.patience else None) if step is not None]
     return stage.model_copy(update={"patience": None, "grow_until": min(end_steps, default=None)})
 
@@ -178,7 +178,7 @@ def begin(pipeline: Pipeline, run: Run, start: Start) -> dict[str, str]:
 
 
 def check_run(pipeline: Pipeline, run: Run) -> None:
-    """Check that all remaining stages can run.  Raises their errors; nothing is written."""
+    """Check that all remaining stages can run, without writing files.  Raises the errors of the stages."""
     for stage in pipeline.stages[run.stage_index :]:
         stage.check_run(run)
 
@@ -190,7 +190,7 @@ def write_pipeline(pipeline: Pipeline, run: Run) -> None:
 
 
 def restore(pipeline: Pipeline, run: Run) -> Path | None:
-    """Restore the newest intact checkpoint, and return its path; None if no checkpoint was saved.  Nothing is written.
+    """Restore the newest intact checkpoint, and return its path, or None if there is none.  Nothing is written.
 
     Raises ConfigError if the checkpoint has other settings, photos, cameras, or points, or is beyond the last step, and
     OutputError if all checkpoints are damaged.

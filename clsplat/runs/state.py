@@ -1,4 +1,4 @@
-"""Read a run folder once, to find the phase of the run and the files that are missing or changed."""
+"""Read a run folder once, and determine the phase of the run and the files that are missing or changed."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -111,7 +111,7 @@ class RunState:
         return "optimize.steps"
 
     def note_on_longer_training(self) -> str:
-        """Describe how a continued training differs from one planned with all steps, or return "" if it does not."""
+        """Describe how a continued training differs from training with all steps from the start; "" if it does not."""
         training = self.pipeline.settings.training
         steps = training.steps
         names = [s.stage for s in training.during if type(s).stale is not Scheduled.stale and s.is_due(steps)]

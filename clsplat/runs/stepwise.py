@@ -21,7 +21,7 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
 
 
 def train(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
-    """Run the stages from the first training to the last one and the edits after it; yield the losses of each step.
+    """Run the stages from the first to the last training, and the edits after it; yield the losses of each step.
 
     A refit starts with the first stage again.
     """
@@ -58,7 +58,7 @@ def _run_final_edits(pipeline: Pipeline, run: Run) -> None:
 
 
 def is_trained(pipeline: Pipeline, run: Run) -> bool:
-    """Return whether all training steps have run, including those of a refit."""
+    """Return whether all training steps have run, including the steps of a refit."""
     _, last_index = _training_stages(pipeline)
     stage = with_refit_steps(pipeline, run).stages[last_index]
     is_at_end = isinstance(stage, Optimize) and run.stage_index == last_index and stage.has_ended(run)

@@ -1,6 +1,6 @@
 """Choose the number of steps that fit into a time budget (`--minutes`).
 
-A short rehearsal measures the time of a training step, and of everything else.  If the rehearsal takes only a small
+A short rehearsal measures the time of a training step and the time of everything else.  If it takes only a small
 fraction of the budget, a longer one follows, because steps become slower as the number of Gaussians grows.  At fixed
 fractions of the training, the number of steps is corrected from measured times.  The run's pipeline contains the number
 of steps, so that the run can be reproduced bit by bit.
@@ -58,7 +58,7 @@ class Rehearsal:
         return math.floor(self.steps * math.pow(times, 1 / (1 + self.trend)))
 
     def later(self, fraction: float) -> tuple[float, float]:
-        """Return the mean and the final step time after a fraction of the training, relative to the time there."""
+        """Return the mean and the final step time after a fraction of the training, relative to the step time there."""
         index = min(int(fraction * len(self.step_times)), len(self.step_times) - 1)
         now = self.step_times[index]
         return fmean(self.step_times[index:]) / now, self.step_times[-1] / now
@@ -201,7 +201,7 @@ def min_steps_of(pipeline: Pipeline) -> int:
 
 
 def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
-    """Return a run of another pipeline, before its first step, with the device, scene, and photos of `run`."""
+    """Return an unstarted run of another pipeline, with the device, scene, and photos of `run`."""
     reset: dict[str, Any] = {
         "best": None,
         "best_tables": {},

@@ -1,4 +1,4 @@
-"""Verify the files of a run folder: whether the required files exist, and whether every file is intact."""
+"""Verify that a run folder has all required files, and that every file is intact."""
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -246,7 +246,7 @@ def lines(result: dict[str, Any]) -> str:
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a pipeline, matrix, run folder, model, or field, given by its path or the name of a shipped pipeline.
+    """Check a pipeline, matrix, run folder, model, or field, given by its path, or a shipped pipeline, by its name.
 
     Returns the path and name of a pipeline or matrix, with its stages and the keys that depend on the photos, or its
     cells; the result of `verify` for a run folder, and of `examine` for a model; the number of parameters of a field.

@@ -140,7 +140,7 @@ def _scene(
 def _make_side(
     name: str | None, plan: VideoPlan, scene: Scene | None, background: Background, device: Device, origin: Floats
 ) -> Side | None:
-    """Return a function from a view to the image next to its frame: the nearest photo, or a render of another model."""
+    """Return a function that returns the image next to a view's frame: the nearest photo, or another model's render."""
     if name is None:
         return None
     if name != PHOTOGRAPH:
@@ -251,7 +251,7 @@ def _warn_about_different_scenes(models: Sequence[Path], source: ModelSource | N
 
 
 def names(models: Sequence[Path]) -> list[str]:
-    """Return a unique name for each model: its folder or file name, with the parent folder if two are equal."""
+    """Return a unique name for each model: its folder or file name, with the parent folder if names repeat."""
     names = [path.resolve().name if path.is_dir() else path.stem for path in models]
     folders = [path.resolve().parent.name for path in models]
     if len(set(names)) < len(names):

@@ -1,1 +1,1 @@
-"""The viewer page, charts and videos."""
+"""Write the viewer page, draw charts, and render videos."""

@@ -128,7 +128,7 @@ def _dash(line: Line) -> tuple[str, str]:
 
 
 def _legend(lines: Sequence[Line]) -> list[str]:
-    """Return the rows of the legend, with each name in the color of its line; no rows for a single line."""
+    """Return a legend row for each line, in the color of the line, or no rows for a single line."""
     rows: list[str] = []
     free_letters = 0
     for i, line in enumerate(lines if len(lines) > 1 else []):
@@ -158,14 +158,14 @@ def _ticks(low: float, high: float, is_integer: bool = False) -> list[float]:
 
 
 def _decade_ticks(low: float, high: float) -> list[float]:
-    """Return the logarithms of 1, 2, and 5 times powers of ten, or of round numbers if fewer than two of these fit."""
+    """Return the logarithms of 1, 2, and 5 times powers of ten, or of round numbers if fewer than two are in range."""
     powers = range(math.floor(low), math.ceil(high) + 1)
     ticks = [t for p in powers for m in (1, 2, 5) if low <= (t := p + math.log10(m)) <= high]
     return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]
 
 
 def _tick_labels(values: Sequence[float], is_integer: bool = False) -> list[str]:
-    """Return tick labels with enough digits to tell them apart: 100k, 100.2k; for integers 8,040 instead of 8.04k."""
+    """Return tick labels with enough digits to be distinct: 100k, 100.2k; for integers 8,040 instead of 8.04k."""
     if is_integer and any(value % 100 for value in values):
         return [f"{value:,.0f}" for value in values]
     candidates = [[_format_number(value, digits) for value in values] for digits in range(3, 10)]
@@ -190,7 +190,7 @@ MAX_POINT_DISTANCE = 3.0  # of points from the center of the cameras, relative t
 def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floating]) -> list[str]:
     """Return SVG plans of cameras, and of points around them, [N, 3]: from above and from the side.
 
-    views: groups of views by their name in the legend.  Each camera shows its name on hover.
+    views: groups of views, by name in the legend.  Each camera shows its name on hover.
     The result is empty for fewer than two cameras.
     """
     views = {name: group for name, group in views.items() if group}

@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Packed:
-    """A packed model: the header, and the compressed planes."""
+    """The header and the compressed planes of a packed model."""
 
     header: dict[str, Any]
     data: bytes  # gzip of the planes
@@ -151,7 +151,7 @@ def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
 
 
 def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
-    """Pack the three smaller components of unit quaternions (x, y, z, w), whose largest is made positive, [N]."""
+    """Pack the three smallest components of unit quaternions (x, y, z, w), [N], after making the largest positive."""
     unit = np.roll(quats.astype(np.float64), -1, axis=1)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     largest, smaller = smallest_three(unit)
@@ -174,13 +174,13 @@ def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArra
 
 
 def _motion_header(columns: int) -> dict[str, int]:
-    """Return the number of columns, of powers of time above the first, and the first column of the rotation, or 0."""
+    """Return the number of columns, the number of terms of degree 2 or more, and the first rotation column, or 0."""
     rotation = motion_fields(columns).get("turn")
     return {"columns": columns, "bends": motion_degree(columns) - 1, "turns": rotation.start if rotation else 0}
 
 
 def _value_table(values: NDArray[np.floating]) -> Floats:
-    """Return a table of 256 ascending values, which are denser where `values` are denser."""
+    """Return a table of 256 ascending values that follow the distribution of `values`."""
     sorted_values = np.sort(np.asarray(values, np.float64), axis=None)
     if not len(sorted_values) or sorted_values[0] == sorted_values[-1]:
         return np.full(256, sorted_values[0] if len(sorted_values) else 0.0)

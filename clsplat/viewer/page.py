@@ -32,7 +32,7 @@ def viewpoint_data(viewpoint: Viewpoint) -> dict[str, Any]:
 
 
 def camera_data(view: View) -> dict[str, Any]:
-    """Return a view's row-major pose and its intrinsics in the format of camera.js."""
+    """Return the row-major pose and the intrinsics of a view in the format of camera.js."""
     c = view.camera
     time = {} if view.time is None else {"time": view.time}
     lens = [c.fx, c.fy, c.cx, c.cy, c.width, c.height]
@@ -40,7 +40,7 @@ def camera_data(view: View) -> dict[str, Any]:
 
 
 def float32_digits(values: NDArray[np.floating]) -> list[float]:
-    """Round values to nine significant digits, which are enough to identify a float32."""
+    """Round values to nine significant digits, which identify a float32 exactly."""
     return [float(f"{value:.9g}") for value in np.asarray(values, np.float64).tolist()]
 
 
@@ -201,6 +201,6 @@ def view_entries(
 
 
 def omitted_indices(sizes: list[int], budget: int) -> set[int]:
-    """Return the indices to omit.  Every n-th item stays, with the smallest n whose total size is within `budget`."""
+    """Return the indices to omit.  Every n-th item is kept, with the smallest n for which the total fits `budget`."""
     interval = next((n for n in range(1, len(sizes) + 1) if sum(sizes[::n]) <= budget), len(sizes) + 1)
     return {i for i in range(len(sizes)) if interval > len(sizes) or i % interval}

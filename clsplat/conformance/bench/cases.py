@@ -1,4 +1,4 @@
-"""Time training steps of several scenes alternately, so that a slow machine affects all of them; report medians."""
+"""Time training steps of several scenes in alternation, so that a slow machine affects all scenes; report medians."""
 
 import statistics
 import time
@@ -41,7 +41,7 @@ MIN_SECONDS = 2e-3  # shortest measurement; the first launch and the final wait 
 
 @dataclass(frozen=True)
 class Peaks:
-    """Peak rates of a device, from which the floors of stages are computed."""
+    """Peak rates of a device, from which the minimum times of stages are computed."""
 
     gflops: float  # multiply-adds count as two
     gexp: float  # 10⁹ exponentials per second
@@ -126,7 +126,7 @@ TINY_RATE = 1e-30  # changes nothing, so that all steps do the same work; a rate
 
 @dataclass
 class BenchResult:
-    """The times of one scene, in ms."""
+    """The times of a training step for one scene, in ms."""
 
     work: Work
     stages: dict[str, float]
@@ -142,7 +142,7 @@ class BenchResult:
 class BenchCase:
     """A scene on which to time training steps with a pipeline's losses, statistics and rendering.
 
-    An exported model has the 3D filter baked into its scales, so that the filter takes no time here.
+    An exported model has its 3D filter baked into the scales, so the time of that filter is not measured.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class BenchCase:
         self.memory = device.peak - self._initial_bytes
 
     def step(self, record: bool, stale: Collection[str] = ()) -> None:
-        """Do one training step.  record: whether to record its times; stale: parameters that are not updated."""
+        """Run one training step.  record: whether to record times; stale: parameters that are not updated."""
         self.device.finish()
         self.device.timings.sampling = record
         start = time.perf_counter()
@@ -195,7 +195,7 @@ class BenchCase:
                 self.stages[name].append(milliseconds)
 
     def repeat(self) -> None:
-        """Do `STEPS` training steps without waits between them; record the mean time."""
+        """Run `STEPS` training steps without waiting between them, and record the mean time."""
         self.device.finish()
         start = time.perf_counter()
         for _ in range(STEPS):
@@ -204,7 +204,7 @@ class BenchCase:
         self.mean_step_times.append(1e3 * (time.perf_counter() - start) / STEPS)
 
     def edit(self) -> None:
-        """Do one density edit that rearranges all tables and changes nothing."""
+        """Run a density edit that rearranges all tables without changing any Gaussian."""
         self.device.finish()
         start = time.perf_counter()
         edit = Edit(self.trainer.model.gaussians, self.trainer.stats, SceneScale(1.0), step=1, seed=0)
@@ -305,6 +305,6 @@ def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) 
 
 
 def with_near(settings: PipelineFile, near: float) -> PipelineFile:
-    """Return the settings with `auto` for the near plane replaced by `near`, in scene units."""
+    """Return the settings, with `near`, in scene units, as the near plane if it is `auto`."""
     model = settings.model.model_copy(update={"near": near})
     return settings.model_copy(update={"model": model}) if settings.model.near == "auto" else settings

@@ -1,4 +1,4 @@
-"""List the checks of all kernels, and the essential checks, which a run performs on the first use of a device."""
+"""List the checks of all kernels, and the essential checks, which run when a device is first used."""
 
 from clsplat.conformance.check import Check
 from clsplat.conformance.checks import (

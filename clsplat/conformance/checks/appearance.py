@@ -33,7 +33,7 @@ CASES = (  # width, height, nodes
 
 
 def random_grids(device: Device, rng: np.random.Generator, nodes: tuple[int, ...], weight: float = 1.0) -> GridState:
-    """Return random grids of three photographs."""
+    """Return random bilateral grids of three photographs."""
     grids = GridState(BilateralGrid(grid_shape=list(nodes), weight=weight), ("a", "b", "c"), device)
     grids.load({}, {"values": rng.normal(0, 0.2, grids.shape).astype(np.float32)})
     return grids
@@ -45,7 +45,7 @@ def photograph_grid(grids: GridState, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def image_for(rng: np.random.Generator, grid: NDArray[Any], width: int, height: int, channels: int) -> NDArray[Any]:
-    """Return an image with values below black and above white, and none within MARGIN of a threshold."""
+    """Return a random image with values below 0 and above 1, but no values within MARGIN of a threshold."""
     image = rng.uniform(-0.2, 1.4, (channels, height, width)).astype(np.float32)
     exact = image[:3].astype(np.float64)
     luminance = np.einsum("a,ahw->hw", LUMINANCE, exact)
@@ -60,7 +60,7 @@ def image_for(rng: np.random.Generator, grid: NDArray[Any], width: int, height: 
 def check_grid(
     device: Device, rng: np.random.Generator, width: int, height: int, nodes: tuple[int, ...], channels: int = 3
 ) -> Results:
-    """Compare an image, its gradient, and the gradient of the grid."""
+    """Compare the image after a grid, and the gradients of the image and the grid."""
     label = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
     grids = random_grids(device, rng, nodes)
     grid = photograph_grid(grids, grids.tables()["values"][1])
@@ -92,7 +92,7 @@ def check_grid(
 
 
 def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]) -> Results:
-    """Compare the smoothness of a grid and three updates, and check that the other grids do not change."""
+    """Compare the smoothness of a grid and the results of three updates; check that the other grids do not change."""
     label, weight = f"{' x '.join(map(str, nodes))} matrices", 0.7
     grids, workspace = random_grids(device, rng, nodes, weight), Workspace(device)
     expected = grids.tables()["values"].astype(np.float64).reshape(3, -1)
@@ -137,7 +137,7 @@ def color_grid_tables(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_color(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
-    """Compare an image with a third of its pixels above white, its gradient, and the gradient of the matrix."""
+    """Compare the image after a color matrix, with a third of its pixels above 1, and both gradients."""
     label = f"{width} x {height} px"
     matrix = (IDENTITY + rng.normal(0, 0.2, (3, 4))).astype(np.float32).astype(np.float64)
     image = rng.uniform(-0.2, 1.6, (channels, height, width)).astype(np.float32)
@@ -176,7 +176,7 @@ def colors(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_response(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
-    """Compare a camera response on an image with values below black and above white, and both gradients."""
+    """Compare the image after a camera response, with values below 0 and above 1, and both gradients."""
     label, kernel = f"{width} x {height} px", "camera_response"
     row = np.concatenate([rng.normal(0, 0.1, 5), rng.normal(0, 0.4, 12)])
     image = rng.uniform(-0.3, 1.5, (channels, height, width)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Check blending: images, the sums over pixels from which gradients come, inverse depths, and layers."""
+"""Check blending: images, the sums over pixels from which gradients are computed, inverse depths, and layers."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -33,7 +33,7 @@ def render(device: Device, case: Case, sort: Sort = "radix") -> Frame:
 
 
 def check_blend(device: Device, case: Case, label: str, sort: Sort = "radix") -> Results:
-    """Compare the image and the transmittance of a scene; the padding of both is zero."""
+    """Compare the image and the transmittance of a scene, and check that their padding is zero."""
     frame, (width, height) = render(device, case, sort), case.size
     image, transmittance = frame.image.get(), frame.transmittance.get()
     outside = np.concatenate([image, transmittance[None]])
@@ -87,7 +87,7 @@ def _make_opaque(parameters: dict[str, NDArray[Any]]) -> None:
 
 
 def make_dim(parameters: dict[str, NDArray[Any]]) -> None:
-    """Make splats so faint that transmittance falls below 0.01 within a batch of 256, but 40 more still contribute."""
+    """Make splats so faint that transmittance falls below 0.01 within a batch of 256, and 40 more contribute."""
     parameters["log_scales"] += 4
     parameters["logit_opacity"][:] = -3.7
 

@@ -1,4 +1,4 @@
-"""Check density control: statistics of views, rules, the rows of an edit, noise, scores and clusters."""
+"""Check density control: statistics of views, rules, the rows of an edit, noise, scores, and clusters."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -100,7 +100,7 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
 
 
 def _run_edit(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
-    """Return tables of random Gaussians on both sides of each threshold, and these Gaussians after an edit."""
+    """Return the tables of random Gaussians on both sides of each threshold, before and after an edit."""
     case = random_case(rng, count)
     p = case.parameters
     sizes = EXTENT * rng.choice([0.003, 0.03, 0.12, 0.4], (count, 1))
@@ -237,7 +237,7 @@ def contribution(device: Device, rng: np.random.Generator) -> Results:
 def _render_views(
     device: Device, case: Case, photographs: list[Photograph], background: NDArray[Any]
 ) -> Iterator[RenderedView]:
-    """Yield the views of photographs, which a new rasterizer renders from a new model."""
+    """Render the views of photographs with a new rasterizer from a new model, and yield each."""
     rasterizer = Rasterizer(device, "radix")
     return RenderedView.render_all(rasterizer, case.model(device), photographs, device.upload(background))
 
@@ -254,7 +254,7 @@ def _falloff_squares(case: Case, background: NDArray[Any], mask: Mask | None) ->
 
 @CHECKS.add("most_alike")
 def most_alike_labels(device: Device, rng: np.random.Generator) -> Results:
-    """Compare the labels of the most similar vectors.  Values are integers, so all products are exact."""
+    """Compare the index of each point's most similar vector.  Values are integers, so all products are exact."""
     for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
         points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
         vectors[-1] = vectors[0]  # a tie, which the first wins

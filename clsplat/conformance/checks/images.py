@@ -152,7 +152,7 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
 def check_haar(
     device: Device, rng: np.random.Generator, width: int, height: int, fraction: float | None, taps: NDArray[Any]
 ) -> Results:
-    """Compare an image after the Haar filter, and the gradient of the filter's taps; `fraction` of pixels count."""
+    """Compare the image after a Haar filter and the gradient of its taps.  A `fraction` of pixels is unmasked."""
     image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
     mask = None if fraction is None else rng.random((height, width)) < fraction
     camera, workspace = make_camera(device, width, height), Workspace(device)
@@ -211,7 +211,7 @@ SCALES = (1.0, 1e-2, 8.0)  # factors on differences; some put residuals outside 
 def check_transient(
     device: Device, rng: np.random.Generator, width: int, height: int, scale: float, fraction: float | None
 ) -> Results:
-    """Compare residuals, their histogram, and masks; `fraction` of the pixels count, all if it is None."""
+    """Compare residuals, their histogram, and masks.  A `fraction` of pixels is unmasked; None: all pixels."""
     x, y = image_pair(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
     valid = np.ones((height, width), bool) if fraction is None else rng.random((height, width)) < fraction

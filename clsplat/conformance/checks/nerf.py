@@ -39,7 +39,7 @@ EDGES = 2e-6  # bound on distances, relative to the largest
 
 @dataclass(frozen=True)
 class GridLevel:
-    """A level of a grid, and the index of its first entry in the parameters."""
+    """A level of a hash grid, and the index of its first entry in the parameters."""
 
     level: ref.HashLevel
     first: int
@@ -84,7 +84,7 @@ class FieldCase:
 
     @property
     def device_parameters(self) -> Array:
-        """A new copy of the parameters on the device."""
+        """The parameters in a new array on the device."""
         return self.levels.workspace.device.upload(self.parameters)
 
     def units(self, samples: int, kind: int) -> NDArray[np.float64]:
@@ -95,7 +95,7 @@ class FieldCase:
         return np.stack([ref.random_units(ray, samples + 1, kind, draw.seed, draw.step) for ray in rays])
 
     def target_colors(self) -> NDArray[np.float64]:
-        """Return the photograph's colors of the rays, without padding, [rays, 3]."""
+        """Return the colors of the rays in the photograph, without padding, [rays, 3]."""
         pixels = self.rays.pixels.get()
         return self.photograph[:, pixels // WIDTH, pixels % WIDTH].T.astype(np.float64)
 
@@ -118,7 +118,7 @@ class FieldCase:
         return ref.grid_positions(means, variances, np.array(self.shape.grid.corner), self.shape.grid.side)
 
     def grid_levels(self) -> list[GridLevel]:
-        """Return the levels of the grid; an empty list if the field has no grid."""
+        """Return the levels of the hash grid, or an empty list if the field has no grid."""
         table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.network_parameters
         return [
             GridLevel(ref.HashLevel(cells, entries), first + FEATURES * offset) for cells, offset, entries, _ in table
@@ -126,7 +126,7 @@ class FieldCase:
 
 
 def read_rows(table: Array, first: int, count: int) -> NDArray[Any]:
-    """Return features `first` to `first + count` of each sample, [S, count], from [tiles, rows, SAMPLES]."""
+    """Return `count` features of each sample from row `first` on, [S, count].  table: [tiles, rows, SAMPLES]."""
     return np.asarray(table.get()[:, first : first + count].transpose(0, 2, 1).reshape(-1, count))
 
 
@@ -212,7 +212,7 @@ def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
 
 
 def _random_positions(rng: np.random.Generator, tiles: int, bounds: tuple[float, float]) -> NDArray[np.float32]:
-    """Return random samples of all sizes, [tiles, PLACE_ROWS, SAMPLES], with a sixth of the means on faces of cells."""
+    """Return random samples of all sizes, [tiles, PLACE_ROWS, SAMPLES]; a sixth of the means are on faces of cells."""
     means = rng.uniform(*bounds, (tiles, 3, SAMPLES))
     faces = np.where(rng.random(means.shape) < 1 / 6, np.rint(4 * means) / 4, means)
     return np.concatenate([faces, 10.0 ** rng.uniform(-9, 0, (tiles, 1, SAMPLES))], axis=1).astype(np.float32)
@@ -348,7 +348,7 @@ class _Comparison:
         yield compare_max("composite_forward", label, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 
     def backward(self, ray_count: int) -> tuple[ref.Weights, NDArray[np.float64]]:
-        """Return the gradients of the weights and of the encoded positions, without rays of padding."""
+        """Return the gradients of the weights and of the encoded positions, without the padding rays."""
         grad_colors = 2 * self.scale * self.differences
         grad_colors[ray_count:] = 0
         grad_raw, grad_densities = self.composite.backward(grad_colors)

@@ -101,7 +101,7 @@ def record_covariances(record: NDArray[Any]) -> NDArray[Any]:
 
 
 def _wrong_extents(record: NDArray[Any], truth: ref.Splats, is_rendered: NDArray[Any]) -> NDArray[Any]:
-    """Return a mask of the extents that miss pixels with an alpha of 1/255 or more, or that are much too large."""
+    """Return a mask of the extents that exclude pixels with an alpha of 1/255 or more, or that are much too large."""
     reach2 = 2 * np.log(255 * truth.opacity[is_rendered])
     a, b, c = truth.conic[is_rendered].T
     half_x, half_y = np.sqrt(reach2 * c / (a * c - b * b)), np.sqrt(reach2 * a / (a * c - b * b))
@@ -116,7 +116,7 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, is_rendered: NDArray
 
 
 def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
-    """Compare the gradients of the parameters for the same sums over each Gaussian's pixels."""
+    """Compare the gradients of the parameters, computed from the same pixel sums by kernel and reference."""
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(model, camera, device.zeros(3))
@@ -134,7 +134,7 @@ def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: 
 
 
 def check_long_splats(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
-    """Compare the gradients of each Gaussian, relative to the largest, for the loss Σ weights · image."""
+    """Compare the gradients of the loss Σ weights · image for each Gaussian, relative to its largest gradient."""
     model, rasterizer, (width, height) = case.model(device), Rasterizer(device, "radix"), case.size
     frame, truth = rasterizer.forward(model, case.device_camera(device), device.zeros(3)), case.project()
     weights, gaussians = scipy.ndimage.gaussian_filter(rng.normal(size=(3, height, width)), (0, 2, 2)), model.gaussians
@@ -229,7 +229,7 @@ def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator)
 
 
 def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: int) -> Results:
-    """Hide Gaussians in training views; compare each view's image with an image of only the other Gaussians."""
+    """Hide Gaussians in training views; compare the image of each view with an image without these Gaussians."""
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     hidden_masks = rng.random((views, count)) < 0.5
     hide(model.gaussians, hidden_masks)
@@ -267,7 +267,7 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Res
 
 @CHECKS.add("project_backward")
 def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
-    """Compare the gradients of long splats for sums over a blended image.  In other formulas, their terms cancel."""
+    """Compare the gradients of long splats in a blended image.  In less stable formulas, terms cancel."""
     for aspect in ASPECTS:
         for name, settings in LONG_FILTERS.items():
             case = needle_case(rng, 12, aspect, **settings)
@@ -313,7 +313,7 @@ def depth(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
-    """Compare the gradients of the pose and the focal length for the same sums over each Gaussian's pixels."""
+    """Compare the gradients of pose and focal length, computed from the same pixel sums by kernel and reference."""
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device, "radix")
     frame, count = rasterizer.forward(model, camera, device.zeros(3)), model.gaussians.count
     pixel_sums = np.full((PIXEL_SUMS, model.gaussians.capacity), np.nan, np.float32)

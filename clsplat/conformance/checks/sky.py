@@ -1,4 +1,4 @@
-"""Check the sky, an environment map behind the Gaussians: images, gradients, the cover loss, and updates."""
+"""Check the environment map of the sky: images, gradients, the loss of Gaussians that cover it, and updates."""
 
 from dataclasses import replace
 from typing import Any
@@ -58,7 +58,7 @@ def flatten_map(texels: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def check_sky(device: Device, rng: np.random.Generator, width: int, height: int, side: int) -> Results:
-    """Compare an image and the gradient of the map.  Finished pixels have a negative transmittance."""
+    """Compare an image with sky and the gradient of the map.  Saturated pixels have a negative transmittance."""
     view, label = SkyView(device, rng, width, height, side), f"{width} x {height} px, {side} texels per side"
     image, gradient = rng.random((3, height, width)), rng.normal(size=(3, height, width)).astype(np.float32)
     planes = view.planes(image)
@@ -111,7 +111,7 @@ def cover_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("sky_update")
 def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
-    """Compare three updates, and check that texels outside the view stay unchanged."""
+    """Compare three Adam updates, and check that texels outside the view do not change."""
     side = 16
     view, texels = SkyView(device, rng, 9, 7, side), side**2
     visible = view.skies.runs(view.camera, side).shown.get()

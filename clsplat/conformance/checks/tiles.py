@@ -24,7 +24,7 @@ def make_tiler(device: Device, sort: Sort = "radix") -> Tiler:
 
 
 def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
-    """Compare an exclusive prefix sum, which saturates at the largest uint32."""
+    """Compare an exclusive prefix sum that saturates at the largest uint32."""
     offsets = make_tiler(device).scan(device.upload(values), len(values), "test").get()
     expected = np.minimum(np.concatenate([[0], np.cumsum(values, dtype=np.uint64)]), 2**32 - 1).astype(np.uint32)
     return match("scan_offsets", f"sums of {len(values)} values", offsets, expected)
@@ -91,7 +91,7 @@ def tile_lists(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
-    """Check that each tile lists every splat that reaches it exactly once, front to back, and few others."""
+    """Check that each tile lists every splat that reaches it exactly once, front to back, and few other splats."""
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     lists, tiles, count = frame.lists, frame.camera.tiles, len(case.parameters["means"])
@@ -122,9 +122,9 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
 
 
 def _max_alpha(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the largest alpha of each record in each tile, and whether it determines if the pair is allowed, [T, N].
+    """Return the largest alpha of each record in each tile, and whether it decides if the pair is allowed, [T, N].
 
-    The alpha does not determine it for tiles at the edge of the image and for splats thinner than a few pixels, whose
+    The alpha does not decide this for tiles at the edge of the image and for splats thinner than a few pixels, whose
     pairs may be listed although they reach no pixel.
     """
     records, camera = frame.splats.get().astype(np.float64), frame.camera
@@ -154,7 +154,7 @@ UNTOUCHED = 0xDEADBEEF
 
 
 def large_case(device: Device, rng: np.random.Generator, columns: int, rows: int, count: int = 6) -> Case:
-    """Return a case of Gaussians half as large as the image's longer side; every third is ten times smaller.
+    """Return a case of Gaussians half as large as the image's longer side, of which every third is ten times smaller.
 
     columns, rows: size of the image, in tiles.
     """

@@ -1,4 +1,4 @@
-"""Check the kernels that change tables: Adam, deferred updates, penalties, rows, averages, and dropout."""
+"""Check the kernels of training: Adam, deferred updates, penalties, updates of visible rows, averages, and dropout."""
 
 from dataclasses import replace
 from typing import Any
@@ -32,7 +32,7 @@ SPLAT_OPACITY = int(constants("splat.h")["SPLAT_OPACITY"])
 
 
 def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
-    """Compare three updates from gradients of very different magnitudes."""
+    """Compare three Adam updates from gradients of very different magnitudes."""
     case = random_case(rng, count)
     model = case.model(device)
     adam, rates = Adam(model.gaussians), Rates().at(3, extent=2.0)
@@ -76,7 +76,7 @@ def _random_pixel_sums(
 
 
 def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare one fused update: moments for the reference's gradients, and values for the device's moments."""
+    """Compare moments and values after one fused update.  Expected values are computed from the device's moments."""
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
     gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
@@ -95,7 +95,7 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str
 
 
 def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare the fifth update, of visible rows only, by each kernel, from the same gradients and moments."""
+    """Compare the fifth update, limited to visible rows, by each kernel, given the same gradients and moments."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
         name: (rng.normal(size=values.shape), rng.uniform(0.5, 2, values.shape))
@@ -257,9 +257,9 @@ def seen_rows(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
 def train(
     device: Device, model: DeviceModel, seen: list[NDArray[np.bool_]], gradients: list[NDArray[np.float32]], rows: Rows
 ) -> dict[str, NDArray[np.float32]]:
-    """Update a model once for each view, and return the harmonics and their moments.
+    """Update a model once for each view, and return the SH coefficients and their moments.
 
-    seen: for each view, the mask of visible rows, [N]; gradients: of the harmonics, [N, components].
+    seen: for each view, the mask of visible rows, [N]; gradients: of the SH coefficients, [N, components].
     """
     gaussians, adam = model.gaussians, Adam(model.gaussians)
     camera = random_case(np.random.default_rng(0), 1).device_camera(device)
@@ -315,7 +315,7 @@ def averages(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_average(device: Device, rng: np.random.Generator, count: int) -> Results:
-    """Compare the average of three steps.  If there are several rows, the last is new after the first step."""
+    """Compare the average over three steps.  If there are several rows, the last is added after the first step."""
     steps = [random_case(rng, count).parameters for _ in range(3)]
     gaussians = random_case(rng, count).model(device).gaussians
     adam.attach_average(gaussians)

@@ -1,9 +1,9 @@
-"""Compute 3D Gaussian splatting and its gradients in float64 NumPy; the code is simple, not fast.
+"""Compute 3D Gaussian splatting and its gradients in float64 with NumPy.  The code is simple, but slow.
 
-Kerbl et al. 2023 (3DGS), with the filters of Yu et al. 2024 (Mip-Splatting).
+The formulas are those of Kerbl et al. 2023 (3DGS), with the filters of Yu et al. 2024 (Mip-Splatting).
 
 Conventions: OpenCV camera (x right, y down, z forward); the center of pixel (0, 0) is (0.5, 0.5); quaternions are
-(w, x, y, z); `grad_x` is dL/dx.  Letters: N Gaussians, K harmonics, C = 3 channels, H, W image.
+(w, x, y, z); `grad_x` is dL/dx.  Sizes: N Gaussians, K SH coefficients, C = 3 channels, H x W pixels.
 """
 
 from clsplat.conformance.reference.appearance import *

@@ -14,14 +14,14 @@ WEIGHTS = np.array([0.299, 0.587, 0.114])  # of the luminance, BT.601
 
 
 def apply_color_grid(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
-    """Return min(1, c + A [c; 1]) for every pixel; A is the grid, interpolated at its position and luminance."""
+    """Return min(1, c + A [c; 1]) for every pixel.  A is the grid, interpolated at its position and luminance."""
     return np.minimum(unclamped_grid_colors(image, grid), 1)
 
 
 def color_grid_backward(
     image: NDArray[Any], grid: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * output) with respect to image and grid, zero through clamped values."""
+    """Return the gradients of sum(gradient * output) with respect to image and grid; 0 for clamped values."""
     upstream = np.where(unclamped_grid_colors(image, grid) < 1, gradient, 0)
     grad_image, grad_grid, homogeneous = upstream.copy(), np.zeros(grid.shape), _to_homogeneous(image)
     luminance = np.einsum("a,ahw->hw", WEIGHTS, image)
@@ -37,7 +37,7 @@ def color_grid_backward(
 
 
 def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """Return the sum over axes of the mean squared difference of neighboring nodes, and its gradient."""
+    """Return the mean squared difference of adjacent nodes, summed over the axes, and its gradient."""
     value, gradient = 0.0, np.zeros(grid.shape)
     for axis in (2, 3, 4):
         difference = np.diff(grid, axis=axis)
@@ -49,7 +49,7 @@ def grid_smoothness(grid: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def center_grids(grids: NDArray[Any]) -> NDArray[Any]:
-    """Subtract the mean over photographs and positions at each level.  grids: [photographs, 3, 4, nz, ny, nx]."""
+    """Subtract the mean over photographs and positions from each level.  grids: [photographs, 3, 4, nz, ny, nx]."""
     return grids - grids.mean(axis=(0, 4, 5), keepdims=True)
 
 
@@ -64,9 +64,9 @@ def unclamped_grid_colors(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[An
 
 
 def _corners(image: NDArray[Any], grid: NDArray[Any]) -> Iterator[tuple[Any, NDArray[Any], NDArray[Any]]]:
-    """Yield the nodes around each pixel, their weights, and the derivatives of the weights by the level.
+    """Yield the nodes around each pixel, their weights, and the derivatives of the weights with respect to luminance.
 
-    Nodes are (k, j, i), and all arrays [H, W].
+    Nodes are tuples (k, j, i).  All arrays are [H, W].
     """
     _, _, nz, ny, nx = grid.shape
     _, height, width = image.shape
@@ -92,7 +92,7 @@ def apply_color_matrix(image: NDArray[Any], matrix: NDArray[Any]) -> NDArray[Any
 def color_matrix_backward(
     image: NDArray[Any], matrix: NDArray[Any], gradient: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the gradients of sum(gradient * output) with respect to image and matrix; zero for clamped values."""
+    """Return the gradients of sum(gradient * output) with respect to image and matrix; 0 for clamped values."""
     upstream = np.where(_transform(image, matrix) < 1, gradient, 0)
     grad_image = np.einsum("ab,ahw->bhw", matrix[:, :3], upstream)
     homogeneous = np.concatenate([image, np.ones((1, *image.shape[1:]))])
@@ -170,7 +170,7 @@ def _locate_quarter(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _curve(x: NDArray[Any], slopes: NDArray[Any]) -> NDArray[Any]:
-    """Return the integral from 0 of slopes that are linear between quarters, and constant below 0 and above 1."""
+    """Integrate slopes from 0 to x.  They are linear between multiples of 1/4, and constant below 0 and above 1."""
     quarter, d = _locate_quarter(x)
     start_value = np.concatenate([[0], np.cumsum(slopes[1:] + slopes[:-1]) / 8])[quarter]
     value = start_value + slopes[quarter] * d + 2 * (slopes[quarter + 1] - slopes[quarter]) * d**2

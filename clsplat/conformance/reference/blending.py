@@ -140,7 +140,7 @@ def background_planes(background: NDArray[Any]) -> NDArray[Any]:
 def blend(
     splats: Splats, width: int, height: int, background: NDArray[Any], thresholds: Thresholds = Thresholds()
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return the image, [3,H,W], the final transmittance, [H,W], and the number of blended splats, [H,W]."""
+    """Return the image, [3, H, W], the final transmittance, [H, W], and the number of blended splats, [H, W]."""
     image = np.zeros((3, height, width))
     transmittance = np.ones((height, width))
     count = np.zeros((height, width), int)
@@ -240,7 +240,7 @@ def falloff_squares(
 
 
 class Margin(NamedTuple):
-    """Smallest relative distances to thresholds that float32 may cross; infinity if nothing is compared."""
+    """The smallest relative distances to thresholds that rounding may cross; infinity without comparisons."""
 
     alpha: float  # |α / alpha_min - 1| over pixels that have not stopped
     transmittance: float  # |T' / transmittance_min - 1| over splats that are not too faint
@@ -249,7 +249,7 @@ class Margin(NamedTuple):
 
 
 def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thresholds()) -> Margin:
-    """Return the distances of blending from its thresholds, so tests can find scenes that float32 blends alike."""
+    """Return the margin of a scene, with which tests can find scenes that float32 and float64 blend alike."""
     alpha, transmittance, cap = [np.inf], [np.inf], [np.inf]
     for step in blend_steps(splats, width, height, thresholds):
         uncapped = splats.opacity[step.splat] * step.falloff
@@ -320,7 +320,7 @@ def inverse_depth_backward(
 def inverse_depth_loss(
     plane: Floats, positions: tuple[Floats, Floats], targets: Floats, weights: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the terms weight * |D - target|, [K], and the gradient of their sum, [H, W].
+    """Return the losses weight * |D - target|, [K], and the gradient of their sum, [H, W].
 
     plane: D, [H, W]; positions: rows and columns of the pixels; targets: inverse depths, [K].
     """
@@ -339,7 +339,7 @@ def overlay(layer: NDArray[Any], transmittance: NDArray[Any], image: NDArray[Any
 
 
 def gradient_behind(transmittance: NDArray[Any], gradient: NDArray[Any]) -> NDArray[Any]:
-    """Return the gradient of the image behind from the gradient of the composite."""
+    """Return the gradient of the image behind a layer, given the gradient of the composite."""
     return np.concatenate([transmittance * gradient[:3], gradient[3:]])
 
 

@@ -21,7 +21,7 @@ def l1(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def view_error(gradient: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> float:
-    """Return the sum of |gradient * (x - y)|, with the gradient of the losses with respect to x."""
+    """Return the sum of |gradient * (x - y)|.  gradient: of the losses with respect to x."""
     return float(np.abs(gradient * (x - y)).sum())
 
 
@@ -54,7 +54,7 @@ def window_mean(image: NDArray[Any]) -> NDArray[Any]:
 
 
 def _ssim_terms(x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Return μ1, μ2, a1, a2, b1, b2."""
+    """Return the terms of the SSIM: the means μ1 and μ2, numerators a1 and a2, and denominators b1 and b2."""
     mu1, mu2 = window_mean(x), window_mean(y)
     variance1 = window_mean(x * x) - mu1**2
     variance2 = window_mean(y * y) - mu2**2
@@ -112,15 +112,15 @@ def ms_ssim(x: NDArray[Any], y: NDArray[Any], scales: int) -> float:
 
 
 def blur(image: NDArray[Any], sigma: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Return the Gaussian mean within 3 sigma along each axis.  image: [3, H, W]; mask: [H, W]; sigma in px."""
+    """Return Gaussian-weighted means within 3 sigma along each axis.  image: [3, H, W]; mask: [H, W]; sigma: px."""
     return masked_mean(image, math.ceil(3 * sigma), 1 / (2 * sigma * sigma), mask)
 
 
 def masked_mean(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[Any] | None = None) -> NDArray[Any]:
     """Return means of the unmasked pixels within `reach`, weighted by exp(-falloff d²), [3, H, W].
 
-    A pixel without such pixels is unchanged.  image: [3, H, W]; mask: [H, W] bool; reach: px along each axis; falloff:
-    px⁻².
+    A pixel without unmasked pixels in reach is unchanged.  image: [3, H, W]; mask: [H, W] bool; reach: px along each
+    axis; falloff: px⁻².
     """
     _, height, width = image.shape
     counts = np.ones((height, width)) if mask is None else mask.astype(np.float64)
@@ -141,7 +141,7 @@ LOW, HIGH = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2
 
 
 def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
-    """Return the matrix, [length, length], of an analysis with the high-pass filter `taps` and a Haar synthesis."""
+    """Return the matrix, [length, length], of an analysis with high-pass filter `taps` and a Haar synthesis."""
     analysis, synthesis = np.zeros((length, length)), np.zeros((length, length))
     for pair in range(length // 2):
         columns = slice(2 * pair, 2 * pair + 2)
@@ -174,7 +174,7 @@ def haar_gradient(
 ) -> NDArray[Any]:
     """Return the gradient of sum(gradient * filtered image) with respect to the taps, [2].
 
-    The image is quadratic in each tap, so a central difference is exact at any distance.
+    The image is a quadratic function of each tap, so central differences are exact for any step size.
     """
     slopes = [(haar_filter(image, taps + e, mask) - haar_filter(image, taps - e, mask)) / 2 for e in np.eye(2)]
     return np.array([(gradient * slope).sum() for slope in slopes])

@@ -1,4 +1,4 @@
-"""Compute moving Gaussians at a timestamp, and the gradient of their motion, one Gaussian after another.
+"""Compute moving Gaussians at a timestamp and the gradient of their motion, one Gaussian after another.
 
 A row of motion contains the velocity [3], time center, and log of the duration; the acceleration [3] and jerk [3] for
 degree 2 or 3; and the time derivative of the quaternion [4] if Gaussians rotate.  FreeTimeGS (Wang et al. 2025),
@@ -14,7 +14,7 @@ PRESENCE_MIN = 1 / 255
 
 
 def coefficients(row: NDArray[Any], degree: int) -> list[NDArray[Any]]:
-    """Return the vectors b_1, b_2, … of a row's polynomial."""
+    """Return the coefficients b_1, b_2, …, [3] each, of the polynomial in a row of motion."""
     return [row[0:3], row[5:8], row[8:11]][:degree]
 
 

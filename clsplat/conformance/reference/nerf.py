@@ -1,4 +1,4 @@
-"""Compute a field of densities and colors, its network, and the colors of rays, forward and backward in float64.
+"""Compute a field of densities and colors, its network, and the colors of rays, with gradients, in float64.
 
 Barron et al. 2021 (Mip-NeRF); the network is that of Mildenhall et al. 2020.
 """
@@ -19,7 +19,7 @@ Inputs = list[Floats]  # of each layer, [S, inputs]
 
 @dataclass(frozen=True)
 class DenseNetwork:
-    """A network with `depth` layers of the trunk, then the density, bottleneck, condition and color layers.
+    """A network with `depth` trunk layers, followed by density, bottleneck, condition, and color layers.
 
     The encoded position is also an input of the layer after `skip`.
     """
@@ -28,7 +28,7 @@ class DenseNetwork:
     skip: int | None  # layer to whose outputs the position is appended
 
     def forward(self, weights: Weights, position: Floats, direction: Floats) -> tuple[Floats, Floats, Inputs]:
-        """Return raw colors and raw densities, [S, outputs], and the inputs of each layer."""
+        """Return raw colors, [S, 3], raw densities, [S, 1], and the inputs of each layer."""
         inputs, x = [], position
         for i in range(self.depth):
             inputs.append(x)
@@ -132,7 +132,7 @@ def random_units(ray: int, count: int, kind: int, seed: int, step: int) -> Float
 
 
 def coarse_edges(near: float, far: float, samples: int, offsets: Floats | None = None) -> Floats:
-    """Return the edges of a ray's coarse samples, [samples + 1].  offsets: in (0, 1], random for training, or None."""
+    """Return the edges of a ray's coarse samples, [samples + 1].  offsets: random in (0, 1]; None: evenly spaced."""
     edges = np.linspace(near, far, samples + 1)
     if offsets is None:
         return edges

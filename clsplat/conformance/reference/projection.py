@@ -12,7 +12,7 @@ from clsplat.conformance.reference.kinds import PARAMETERS, RADIUS_TILE, Pinhole
 
 
 def _harmonics(x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> list[tuple[Any, ...]]:
-    """Return value, d/dx, d/dy and d/dz of the 16 harmonics, with x, y, z independent."""
+    """Return the values of the 16 harmonics and their derivatives d/dx, d/dy, and d/dz, with x, y, z independent."""
     c0, c1 = 0.28209479177387814, 0.4886025119029199
     a, b, c = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
     d, e, f = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
@@ -49,7 +49,7 @@ def _harmonic_table(directions: NDArray[Any], degree: int) -> NDArray[Any]:
 
 
 def sh_basis(directions: NDArray[Any], degree: int) -> NDArray[Any]:
-    """Return Y_k of unit directions: [..., 3] -> [..., K]."""
+    """Return the SH basis functions Y_k of unit directions: [..., 3] -> [..., K]."""
     return _harmonic_table(directions, degree)[..., 0]
 
 
@@ -59,7 +59,7 @@ def sh_basis_gradient(directions: NDArray[Any], degree: int) -> NDArray[Any]:
 
 
 def rotation_matrix(quat: NDArray[Any]) -> NDArray[Any]:
-    """Return the rotation matrix of q/|q|: [4] -> [3,3]."""
+    """Return the rotation matrix of q/|q|: [4] -> [3, 3]."""
     w, x, y, z = quat / np.linalg.norm(quat)
     return np.array(
         [
@@ -98,7 +98,7 @@ def determinant(matrix: NDArray[Any]) -> float:
 
 @dataclass
 class Footprint:
-    """Intermediate values between the parameters of a Gaussian and its screen covariance, for both passes."""
+    """Intermediate values of the projection of a Gaussian's covariance, for the forward and the backward pass."""
 
     point: NDArray[Any]  # [3] camera space
     rotation: NDArray[Any]  # [3,3] R
@@ -232,7 +232,7 @@ def quat_gradient(quat: NDArray[Any], h: NDArray[Any]) -> NDArray[Any]:
 def point_gradient(
     camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any]
 ) -> NDArray[Any]:
-    """Return dL/d(camera-space point), [3], through the screen position and through J with its clamped ray."""
+    """Return dL/d(camera-space point), [3], through the screen position and the Jacobian J with its clamped ray."""
     x, y, z = foot.point
     fx, fy = camera.fx, camera.fy
     gu, gv = grad_mean2d
@@ -254,7 +254,7 @@ def point_gradient(
 
 
 def ratio_gradient(foot: Footprint) -> NDArray[Any]:
-    """Return d(det V / det V1)/dV, [2, 2], by the quotient rule, where V1 = V + constant."""
+    """Return d(det V / det V1)/dV, [2, 2], where V1 is V plus a constant."""
     det0, det1 = determinant(foot.sharp), determinant(foot.dilated)
     return adjugate(foot.sharp) / det1 - det0 / det1**2 * adjugate(foot.dilated)
 
@@ -262,7 +262,7 @@ def ratio_gradient(foot: Footprint) -> NDArray[Any]:
 def covariance_gradient(
     splats: Splats, n: int, foot: Footprint, compensate: float, grad_conic: NDArray[Any], grad_kappa: float
 ) -> NDArray[Any]:
-    """Return dL/dV, [2,2], from the conic and from κ = sqrt(1 + compensate (det V / det V1 - 1))."""
+    """Return dL/dV, [2, 2], from the gradients of the conic and of κ = sqrt(1 + compensate (det V / det V1 - 1))."""
     # Conic -> 2D covariance: G_V = -K G_K K (for the pixel's box, V is given directly)
     a, b, c = splats.conic[n]
     conic = np.array([[a, b], [b, c]])
@@ -335,7 +335,7 @@ def sampling_interval(
 ) -> NDArray[Any]:
     """Return the smallest depth / focal length over the cameras in which each mean is visible, [N].
 
-    Means that are visible in no camera have the largest interval of the others.
+    Means that no camera sees get the largest interval of the other means.
     """
     intervals = np.full(len(means), np.inf)
     for n, mean in enumerate(means):
@@ -416,7 +416,7 @@ def pose_gradient(
 def focal_gradient(
     camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any], axis: int
 ) -> float:
-    """Return dL/dfx (axis 0) or dL/dfy (axis 1), including the paths through the screen position and through J.
+    """Return dL/dfx (axis 0) or dL/dfy (axis 1), through the screen position and the Jacobian J.
 
     The limits of rays are proportional to 1/f, so J02 = -f limit/z of a clamped ray does not depend on f.
     """

@@ -1,4 +1,4 @@
-"""Compute random numbers by Philox 4x32-10 (Salmon et al. 2011), and normal numbers from them (Box and Muller 1958)."""
+"""Compute random numbers by Philox 4x32-10 (Salmon et al. 2011), and normal ones from these (Box and Muller 1958)."""
 
 import math
 
@@ -20,13 +20,13 @@ def philox(counter: tuple[int, int, int, int], key: tuple[int, int]) -> tuple[in
 
 
 def drop_mask(probability: float, seed: int, step: int, count: int) -> NDArray[np.bool_]:
-    """Return a mask of the Gaussians that a step drops, [count], by a random word for each (Park et al. 2025)."""
+    """Return a mask of the Gaussians that a step drops, [count], from a random word for each (Park et al. 2025)."""
     words = [philox((row, step, 2, 0), (seed, 0))[0] for row in range(count)]
     return np.array([word / 2**32 < probability for word in words])
 
 
 def normal3(counter: tuple[int, int, int, int], key: tuple[int, int]) -> NDArray[np.float64]:
-    """Return three random numbers with standard normal distribution, [3]."""
+    """Return three random numbers with a standard normal distribution, [3]."""
     a, b, c, d = (((bits >> 8) + 1) / 2**24 for bits in philox(counter, key))
     radius, angle = math.sqrt(-2 * math.log(a)), 2 * math.pi * b
     third = math.sqrt(-2 * math.log(c)) * math.cos(2 * math.pi * d)

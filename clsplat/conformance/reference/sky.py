@@ -1,4 +1,4 @@
-"""Compute the sky, an octahedral environment map behind the Gaussians, its gradient, and the cover loss.
+"""Compute images and gradients of the sky, an octahedral environment map, and the loss of Gaussians that cover it.
 
 A map is [side, side, C]: row j, column i.  Directions are [H, W, 3] in the scene.
 """
@@ -62,7 +62,7 @@ def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any
 
 
 def sky_mask(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
-    """Return a mask, [H, W], of pixels with at least 6 pixels of sky in their 3 x 3 neighborhood.
+    """Return a mask, [H, W], of pixels with at least 6 sky pixels in their 3 x 3 neighborhood.
 
     sky, photograph: [3, H, W]; difference: the largest mean absolute difference, over channels, of a sky pixel.
     """

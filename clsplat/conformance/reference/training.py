@@ -1,4 +1,4 @@
-"""Compute changes of Gaussians between steps: Adam, penalties, density rules, splitting matrices, shared means."""
+"""Compute updates of Gaussians between steps: Adam, penalties, density rules, splitting matrices, and cluster means."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -87,7 +87,7 @@ KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # rows afterwards: itself; itself twice;
 
 @dataclass(frozen=True)
 class DensityRule:
-    """Constants of density control; lengths are fractions of the scene extent."""
+    """The constants of density control.  Lengths are fractions of the scene extent."""
 
     clone_gradient: float = 2e-4
     split_gradient: float = 2e-4
@@ -163,7 +163,7 @@ def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
 
 
 def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, ceiling: float = 0.01) -> NDArray[Any]:
-    """Return logits, [N], of opacities that are at most `ceiling` after a 3D filter of factor `filter_ratio`."""
+    """Return logits, [N], whose opacities are at most `ceiling` after multiplication by the filter's `filter_ratio`."""
     opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), ceiling) / filter_ratio
     return np.log(opacity / (1 - opacity))
 
@@ -192,14 +192,14 @@ def screen_splitting(
 
 
 def mean_jacobian(camera: PinholeCamera, mean: NDArray[Any]) -> NDArray[Any]:
-    """Return d(projected mean)/d(mean), [2,3] px per scene unit."""
+    """Return d(projected mean)/d(mean), [2, 3] px per scene unit."""
     x, y, z = camera.rotation @ mean + camera.translation
     perspective = np.array([[camera.fx / z, 0, -camera.fx * x / z**2], [0, camera.fy / z, -camera.fy * y / z**2]])
     return perspective @ camera.rotation
 
 
 def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray[Any]) -> NDArray[Any]:
-    """Lift screen matrices, [N,2,2], to the scene, [N,3,3], keeping the splat's shape constant."""
+    """Convert matrices on the screen, [N, 2, 2], to matrices in the scene, [N, 3, 3], for constant splat shapes."""
     matrices = np.zeros((len(on_screen), 3, 3))
     for n in np.flatnonzero(on_screen.any(axis=(1, 2))):
         jacobian = mean_jacobian(camera, gaussians.means[n])
@@ -208,9 +208,9 @@ def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray
 
 
 def shared_means(values: NDArray[Any], labels: NDArray[Any], weights: NDArray[Any]) -> NDArray[Any]:
-    """Replace each row with the weighted mean of the rows with its label; return [N,c].
+    """Replace each row with the weighted mean of the rows that have its label; return [N, c].
 
-    values: [N,c]; labels, weights: [N].  If all weights of a label are zero, its first row is used instead.
+    values: [N, c]; labels, weights: [N].  If all weights of a label are zero, its first row is used instead.
     """
     means = np.empty(values.shape)
     for label in np.unique(labels):

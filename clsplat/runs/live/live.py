@@ -110,7 +110,7 @@ class Live:
         state.budget.skip()
 
     def _release(self) -> None:
-        """Release the run, because its model may be large, and answer pending requests without an image."""
+        """Drop the reference to the run, whose model may be large, and answer pending requests without an image."""
         self.state.step, self._preview = 0, None
         while request := self.state.requests.first():
             self.state.requests.deliver(request, None)
@@ -146,7 +146,7 @@ class Live:
             self.state.budget.spend(time.perf_counter() - start_time)
 
     def _deliver(self, request: PreviewRequest, preview: Preview) -> None:
-        """Render a request.  The page shows failures, and the training continues."""
+        """Render a request and deliver the image.  A failure is shown on the page, and does not stop the training."""
         try:
             self.state.requests.deliver(request, preview.draw(request))
             self.state.error = ""

@@ -43,7 +43,7 @@ class EncodedPicture:
 
 @dataclass(eq=False)
 class PreviewRequest:
-    """A request of a page for a preview from its camera."""
+    """A request by a page for a preview from its camera."""
 
     page: int  # ID of the page
     view: View
@@ -60,7 +60,7 @@ class RequestQueue:
         self._changed = threading.Condition()
 
     def wait_for(self, request: PreviewRequest, seconds: float) -> bool:
-        """Add a request, which replaces an earlier one of the same page, and wait for its preview.
+        """Add a request, which replaces an earlier request of the same page, and wait for its preview.
 
         Returns False if the queue is full.  After a timeout, `request.picture` is None.
         """
@@ -83,7 +83,7 @@ class RequestQueue:
                 self._requests.remove(request)
 
     def first(self) -> PreviewRequest | None:
-        """Return the oldest request, or None.  Repeated requests of cameras that do not move come last."""
+        """Return the oldest request, or None.  Repeated requests for the same camera come last."""
         with self._changed:
             return min(self._requests, key=lambda request: request.pace == "again", default=None)
 
@@ -156,7 +156,7 @@ class Preview:
         return self._rasterizer
 
     def _side(self, pace: Pace) -> int:
-        """Return the largest image side, px, whose preview is fast enough; the smallest side if none is."""
+        """Return the largest image side, px, for which previews are fast enough; the smallest side if there is none."""
         return next((side for side in SIDES if self._estimate(side) <= TARGET_TIMES[pace]), SIDES[-1])
 
     def _estimate(self, side: int) -> float:
@@ -195,7 +195,7 @@ class Credit:
             return self._update()
 
     def spend(self, amount: float) -> None:
-        """Subtract an amount of time in seconds from the credit."""
+        """Subtract a time in seconds from the credit."""
         with self._lock:
             self._credit = self._update() - amount
             self.spent += amount
@@ -221,7 +221,7 @@ PHOTO_TIMEOUT = 20.0  # s that a request for a photo waits
 
 
 class Pictures:
-    """Reads photos as JPEG, one at a time.  The CPU time is subtracted from the budget of the previews."""
+    """Encodes photos as JPEG, one at a time.  The CPU time is subtracted from the budget of the previews."""
 
     def __init__(
         self, views: Sequence[View], background: tuple[float, float, float], undistorted: Path | None, budget: Credit
@@ -295,7 +295,7 @@ RESERVE = 0.3  # s of credit that repeated previews of still cameras must leave
 
 @dataclass(frozen=True)
 class ShownRun:
-    """The run that the pages show; the runs of a matrix have consecutive numbers."""
+    """The run that the pages show.  The runs of a matrix have consecutive numbers."""
 
     number: int
     title: str

@@ -72,7 +72,7 @@ class Request:
     query: dict[str, str]
 
     def number(self, name: str, minimum: int, maximum: int) -> int:
-        """Return a field of the query as an integer.  Raises RequestError if it is missing or out of range."""
+        """Parse a field of the query as an integer.  Raises RequestError if it is missing or out of range."""
         text = self.query.get(name, "")
         if not (text.isascii() and text.isdecimal() and len(text) <= 12 and minimum <= int(text) <= maximum):
             raise RequestError(400, f"{name}: expected a whole number from {minimum} to {maximum}")
@@ -95,7 +95,7 @@ def parse_request(target: str, host: str, token: str) -> Request:
 
 
 def host_name(host: str) -> str:
-    """Return a Host header without its port, because a tunnel may use another port."""
+    """Return the name in a Host header without the port, because a tunnel may use another port."""
     name, colon, port = host.rpartition(":")
     return name if colon and port.isdecimal() else host
 

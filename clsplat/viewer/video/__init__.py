@@ -1,1 +1,1 @@
-"""Videos of a model: camera paths, the views along them, and encoding."""
+"""Make videos of a model: camera paths, views along them, and encoding."""

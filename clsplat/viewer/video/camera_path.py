@@ -1,4 +1,4 @@
-"""Read camera paths from files: nerfstudio's camera_path.json, and the list of cameras of 3DGS.
+"""Read camera paths from files: nerfstudio's camera_path.json, and the cameras.json of 3DGS.
 
 render_width, render_height  px       fps, seconds      camera_type  perspective
 camera_path  one entry per frame: camera_to_world (16 values, row-major, OpenGL axes), fov (degrees, vertical),
@@ -140,7 +140,7 @@ def _camera(size: Size, fov: float) -> Camera:
 
 
 def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
-    """Return the frame size, rounded down to even sides, and the frames per second; defaults if the file has none."""
+    """Return the frame size, rounded down to even sides, and the frames per second, or defaults if they are missing."""
     sides, fps = [document.number(key) for key in ("render_width", "render_height")], document.number("fps")
     width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
     try:
@@ -150,7 +150,7 @@ def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
 
 
 def _rows(values: Any) -> Any:
-    """Reshape 16 values to four rows.  Return any other value unchanged; the caller rejects it."""
+    """Reshape 16 values to four rows.  Return any other value unchanged, which the caller rejects."""
     if not isinstance(values, list) or len(values) != 16:
         return values
     return [values[i : i + 4] for i in range(0, 16, 4)]
@@ -181,7 +181,7 @@ def _world_transform(path: Path, scene: Path | None) -> Any:
 
 
 def _affine(file: Path) -> tuple[Floats, float]:
-    """Read the rotation and translation, [3, 4], and the scale from a file WORLD.  Raises DataError."""
+    """Read the rotation and translation, [3, 4], and the scale from a WORLD file.  Raises DataError."""
     table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
     frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
     matrix, scale = _rigid(frame, "transform"), frame.number("scale")
@@ -202,7 +202,7 @@ def _rigid(frame: JsonFrame, key: str) -> Floats:
 
 
 def _applied_transform(scene: Path | None) -> Floats:
-    """Read the transform, [3, 4], that nerfstudio applied to the poses of a scene's transforms.json, or identity."""
+    """Return the transform, [3, 4], that nerfstudio applied to poses in transforms.json; by default the identity."""
     file = scene / TRANSFORMS if scene else None
     if file is None or not file.is_file():
         return np.eye(3, 4)

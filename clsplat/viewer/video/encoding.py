@@ -51,7 +51,7 @@ def _find_uids(data: bytes, start: int, end: int) -> Iterator[tuple[int, int]]:
 
 
 def _read_integer(data: bytes, start: int, keep_marker: bool) -> tuple[int, int]:
-    """Read an EBML variable-length integer with or without its length marker; return it and the end offset."""
+    """Read an EBML variable-length integer, with or without its length marker; return it and the offset of its end."""
     length = 9 - data[start].bit_length() if start < len(data) else 1
     value = int.from_bytes(data[start : start + length], "big")
     return (value if keep_marker else value & ((1 << (7 * length)) - 1)), start + length
@@ -67,7 +67,7 @@ ALTERNATIVE = "or write images with --out DIR, which any encoder reads"
 
 
 def check_file(path: Path) -> None:
-    """Raise ConfigError if the suffix is unknown, has no encoder, or the name belongs to a file of a run."""
+    """Raise ConfigError if the suffix is unknown or has no encoder, or if the name belongs to a file of a run."""
     check_encoder(path)
     check_result_path(path, path.suffix.lower())
 
@@ -83,7 +83,7 @@ def check_encoder(path: Path) -> None:
 
 @contextmanager
 def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
-    """Yield a function that writes a frame; the complete file is read back at the end of the block.
+    """Yield a function that writes a frame.  At the end of the block, the file is read back as a check.
 
     size: width and height of a frame, px, both even.  Raises OutputError, and then keeps an existing file.
     """
@@ -198,7 +198,7 @@ def _require_av() -> ModuleType:
 
 @contextmanager
 def _without_codec_message() -> Iterator[None]:
-    """Discard a message of OpenCV's FFmpeg about the codec, which no setting suppresses."""
+    """Discard a message about the codec from OpenCV's FFmpeg, which no setting suppresses."""
     try:
         stderr_copy = os.dup(2)
     except OSError:  # closed

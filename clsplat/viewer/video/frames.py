@@ -56,7 +56,7 @@ class Canvas:
 
 
 def layer_image(layers: Layers, layer: str, depths: tuple[float, float]) -> Image:
-    """Return one of LAYERS as 8-bit RGB, [height, width, 3].  depths: near and far, scene units."""
+    """Return a layer, named in LAYERS, as 8-bit RGB, [height, width, 3].  depths: near and far, scene units."""
     if layer == "color":
         return to_8_bits(layers.image)
     if layer == "alpha":
@@ -66,7 +66,7 @@ def layer_image(layers: Layers, layer: str, depths: tuple[float, float]) -> Imag
 
 
 def layer_values(layers: Layers, layer: str) -> NDArray[np.float32]:
-    """Return one of LAYERS as floats, [height, width] or [height, width, 3]."""
+    """Return a layer, named in LAYERS, as floats, [height, width] or [height, width, 3]."""
     array = {"color": layers.image, "depth": layers.depth, "alpha": layers.alpha}[layer]
     assert array is not None
     return array
@@ -91,7 +91,7 @@ def side_by_side(left: Image, right: Image) -> Image:
 
 
 def letterbox(image: Image, size: tuple[int, int]) -> Image:
-    """Scale an image to fit into a size (width, height), centered on a black background."""
+    """Scale an image to fit a size (width, height), and center it on a black background."""
     width, height = size
     factor = min(width / image.shape[1], height / image.shape[0])
     inner = max(1, min(width, round(image.shape[1] * factor))), max(1, min(height, round(image.shape[0] * factor)))

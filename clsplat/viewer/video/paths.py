@@ -32,7 +32,7 @@ MIN_FACING = 0.5  # minimum fraction of cameras with the focus in front of them
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a scene, without outliers, and points of its content."""
+    """The cameras of a scene, without outliers, and points of the visible content."""
 
     views: Sequence[View]
     points: Floats  # [M, 3], the means of a model or the points of a scene
@@ -69,7 +69,7 @@ class Rig:
 
     @cached_property
     def focus(self) -> Floats:
-        """The point nearest to the optical axes, [3], or in the middle of the depth range if they are almost parallel.
+        """The point nearest to the optical axes, [3]; for almost parallel axes, a point at half the depth range.
 
         Raises DataError if most cameras look away from it.
         """
@@ -91,7 +91,7 @@ class Rig:
 
     @cached_property
     def depths(self) -> tuple[float, float]:
-        """Near and far: quantiles of the visible depths, in scene units."""
+        """The near and far depths in scene units, which are quantiles of the visible depths."""
         view_depths = [self._visible_depths(view) for view in self.views[:: -(-len(self.views) // 64)]]
         depths = np.concatenate(view_depths)
         if not len(depths):
@@ -171,7 +171,7 @@ def _nearest_neighbor_tour(distances: Floats) -> Indices:
 
 
 def _shorten(tour: Indices, distances: Floats) -> Indices:
-    """Reverse parts of a tour while that makes it shorter (2-opt), in place."""
+    """Shorten a tour in place by reversing parts of it (2-opt)."""
     for _ in range(ROUNDS):
         has_improved = False
         for i in range(len(tour) - 2):
@@ -247,19 +247,19 @@ def even_size(camera: Camera) -> Size:
 
 
 def same_area(camera: Camera, size: Size) -> Camera:
-    """Return a camera of another image size that views an equally large area; its principal point is the center."""
+    """Return a camera with another image size that views an equally large area, and a centered principal point."""
     width, height = size
     scale = math.sqrt(width * height / (camera.width * camera.height))
     return Camera(width, height, camera.fx * scale, camera.fy * scale, width / 2, height / 2)
 
 
 def fit_inside(camera: Camera, size: Size) -> Camera:
-    """Return a camera of another image size that contains the entire original image, centered."""
+    """Return a camera with another image size whose image contains the entire original image at its center."""
     return center_inside(camera, size, fit_scale(camera, size))
 
 
 def center_inside(camera: Camera, size: Size, scale: float) -> Camera:
-    """Return a camera of another image size with the original image, scaled by a factor, at its center."""
+    """Return a camera with another image size whose image shows the original one, scaled, at its center."""
     width, height = size
     left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
     return Camera(
@@ -388,7 +388,7 @@ def looking_views(positions: Floats, targets: Floats, ups: Floats, rig: Rig, siz
 
 
 def _ring_axes(rig: Rig) -> tuple[Floats, Floats, Floats]:
-    """Return two horizontal principal axes, [2, 3], and the cameras' offsets along them, [V, 2], and along up, [V]."""
+    """Return the horizontal principal axes, [2, 3], and the cameras' offsets along these, [V, 2], and along up, [V]."""
     offsets = rig.positions - rig.focus
     heights = offsets @ rig.up
     flat = offsets - heights[:, None] * rig.up
@@ -422,7 +422,7 @@ def _look_at(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[Vi
 
 
 def nearest_view(view: View, views: Sequence[View], reach: float) -> View:
-    """Return the view whose camera is nearest; a distance of `reach` counts as much as a right angle.
+    """Return the view whose camera is nearest.  A distance of `reach` counts as much as a rotation by 90 degrees.
 
     Among the views of one camera, the nearest in time is returned.
     """

@@ -34,9 +34,9 @@ FULL_RANGE: Times = (0.0, 1.0)
 
 
 def parse_times(value: "str | float | Sequence[float] | None") -> Times | None:
-    """Return the timestamps of the first and the last frame, from one or two numbers or text such as 0..1.
+    """Parse the timestamps of the first and the last frame, given as one or two numbers or as text such as 0..1.
 
-    None stays None.  If the second is smaller, time runs backward.  Raises ConfigError.
+    None is returned unchanged.  If the second timestamp is smaller, time runs backward.  Raises ConfigError.
     """
     if value is None:
         return None
@@ -99,7 +99,7 @@ class VideoRequest:
         size: str | Size | None,
         times: str | float | Sequence[float] | None = None,
     ) -> "VideoRequest":
-        """Parse the settings, and check all that needs no scene.  Raises ConfigError."""
+        """Parse the settings, and check everything that does not depend on the scene.  Raises ConfigError."""
         if path.partition(SEPARATOR)[0] not in PATHS and not path.lower().endswith(".json"):
             raise ConfigError(
                 f"path {quote(path)}: expected one of {', '.join(PATHS)}, or a file of nerfstudio (.json)"
@@ -116,7 +116,7 @@ class VideoRequest:
 
     @property
     def is_file(self) -> bool:
-        """Whether the path is a file, which needs no scene."""
+        """Whether the camera path is a file, which can be read without a scene."""
         return self.path.partition(SEPARATOR)[0] not in PATHS
 
 
