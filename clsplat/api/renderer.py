@@ -175,7 +175,7 @@ class Renderer:
         model, size = result.model, (camera.height, camera.width)
         count = model.gaussians.count
         if depth is not None and model.gaussians.is_moving:
-            raise ValueError("gradient of depth: expected a model that does not move; use `model.at(time)`")
+            raise ValueError("gradient of depth: expected a static model; use `model.at(time)`")
         geometry, grad_depth = None, np.zeros(count)  # grad_depth: dL/d(depth of each mean), float64
         if alpha is not None or depth is not None:
             frame = self._forward(model, camera, np.zeros(3, np.float32), "depth")

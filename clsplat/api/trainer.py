@@ -96,7 +96,7 @@ class Trainer:
         _check_pipeline(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.split)
         if missing := [view.name for view in self.scene.split("train") if not view.has_photograph]:
-            raise DataError(f"{self.scene.path}: the view '{missing[0]}' has no image, which training needs")
+            raise DataError(f"{self.scene.path}: the view '{missing[0]}' has no image; training needs one per view")
         if start != "new" and out is None:
             raise ConfigError(f"start='{start}': expected a run folder as `out`")
         if out is None:
@@ -156,7 +156,7 @@ class Trainer:
             raise StopIteration
         if self._state != "open":
             reason = "ended with an error" if self._state == "failed" else "is closed"
-            raise ClsplatError(f"{self!r} {reason}; create another, with start='resume' if `out` has a checkpoint")
+            raise ClsplatError(f"{self!r} {reason}; create a new one, with start='resume' if `out` has a checkpoint")
         try:
             with (
                 recording_failures(self._run.status, reraise=True),
@@ -254,8 +254,8 @@ def _record_closed(status: StatusFile) -> None:
 def _check_pipeline(pipeline: Pipeline) -> None:
     """Raise ConfigError if a pipeline has no training stage, or if it has `prepare` steps."""
     if pipeline.settings.prepare:
-        raise ConfigError(f"{pipeline.path}: prepares its scene; use clsplat.run, then train with the result")
+        raise ConfigError(f"{pipeline.path}: has `prepare` steps; use clsplat.run, or train on a prepared scene")
     if not any(isinstance(stage, Optimize) for stage in pipeline.stages):
-        raise ConfigError(f"{pipeline.path}: expected a stage 'optimize'")
+        raise ConfigError(f"{pipeline.path}: has no 'optimize' stage; add one")
     for stage in pipeline.stages:
         stage.check()

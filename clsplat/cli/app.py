@@ -130,11 +130,11 @@ def common(
     plugin: Annotated[
         list[Path] | None,
         typer.Option(
-            "--plugin", metavar="FILE", help="A plug-in: a Python file with your own methods; may be repeated."
+            "--plugin", metavar="FILE", help="Plug-in to load: a Python file with custom methods; may be repeated."
         ),
     ] = None,
     attended: Annotated[
-        bool, typer.Option("--attended", hidden=True, help="Stop when standard input closes, as on SIGTERM.")
+        bool, typer.Option("--attended", hidden=True, help="Shut down when standard input closes, as on SIGTERM.")
     ] = False,
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
@@ -145,7 +145,7 @@ def common(
     if limit is not None and limit < MIN_ADDRESS_SPACE:
         raise MemoryLimitError(
             f"`ulimit -v` limits clsplat to {limit >> 20} MiB of address space; libraries crash with less than "
-            f"{MIN_ADDRESS_SPACE >> 20}: raise it"
+            f"{MIN_ADDRESS_SPACE >> 20} MiB: raise the limit"
         )
     if attended:
         stop_when_stdin_closes()
@@ -174,7 +174,7 @@ DeviceOption = Annotated[
     typer.Option(
         metavar="NAME",
         callback=_device_or_global,
-        help="Part of a device's name in `clsplat devices`; NAME:1 is the second match.",
+        help="Part of a device name, as listed by `clsplat devices`; NAME:1 is the second match.",
     ),
 ]
 PipelineArgument = Annotated[
@@ -183,10 +183,10 @@ PipelineArgument = Annotated[
         metavar="PIPELINE",
         autocompletion=recipe_names,
         show_default=False,
-        help="A pipeline file, or the name of a shipped one.",
+        help="A pipeline file, or the name of a shipped pipeline.",
     ),
 ]
-ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file with --scene, or a run folder.")]
+ModelArgument = Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A run folder, or a model file with --scene.")]
 SceneOption = Annotated[
     Path | None,
     typer.Option(

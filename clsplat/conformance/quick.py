@@ -51,7 +51,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
         return
     from clsplat.conformance.checks import BITONIC, ESSENTIAL  # slow to import, and not needed for a verified device
 
-    LOG.info("checking %s; this takes a few seconds, longer if it compiles slowly", info.name)
+    LOG.info("checking %s; this takes a few seconds, or longer if its compiler is slow", info.name)
     for result in run_checks(info, schedule, [*ESSENTIAL, *(BITONIC if bitonic else [])], TIMEOUT_S):
         if result.out_of_memory:
             raise MemoryLimitError(f"{device.text}: {result.failures[0]}; close other programs that use its memory")

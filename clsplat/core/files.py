@@ -46,11 +46,11 @@ def atomic_path(path: Path, suffix: str = "") -> Iterator[Path]:
     file.
     """
     if not path.name:
-        raise OutputError(f"{path}: cannot be written (it has no file name); give the path of a file")
+        raise OutputError(f"{path}: cannot be written (it has no file name); use the path of a file")
     temporary = _temporary_path(path, suffix)
     try:
         if path.exists() and not path.is_file():  # os.replace would replace a device too
-            raise OutputError(f"{path}: cannot be written (it is not a file); use another name")
+            raise OutputError(f"{path}: cannot be written (not a regular file); use another name")
         make_folder(path.parent)
         yield temporary
         _replace(temporary, path)
@@ -105,7 +105,7 @@ def require_free(folder: Path) -> None:
         is_free = not path_exists(folder) or (folder.is_dir() and not any(folder.iterdir()))
     # os.replace cannot replace links and mount points
     if not (is_free and folder.name) or folder.is_symlink() or os.path.ismount(folder):
-        raise ConfigError(f"{folder}: already exists; give a new folder")
+        raise ConfigError(f"{folder}: already exists; use a new folder")
 
 
 @contextmanager
@@ -304,7 +304,7 @@ def invalid_output_reason(text: str) -> str | None:
 def check_result_path(path: Path, suffix: str) -> None:
     """Raise ConfigError if a result path has the wrong suffix or is a file of a run."""
     if path.suffix.lower() != suffix:
-        raise ConfigError(f"{path}: give a file name that ends in {suffix}")
+        raise ConfigError(f"{path}: use a file name that ends in {suffix}")
     if path.name != COMPARISON:
         check_not_run_file(path)
 

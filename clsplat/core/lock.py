@@ -83,7 +83,7 @@ def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[
                 return read_owner(file)
             if not is_logged:
                 is_logged = True
-                LOG.info("%s: was just in use on another machine; waiting up to a minute for its heartbeat", folder)
+                LOG.info("%s: was recently in use on another machine; waiting up to a minute for its heartbeat", folder)
         time.sleep(1)
 
 
@@ -199,7 +199,7 @@ def _resolve(folder: Path, file: Path) -> Path:
     path = file.parent.resolve() / file.name
     _require_not_held(path, folder)
     if path.is_symlink():
-        raise OutputError(f"{file}: is a link, and lock files are not followed; remove it")
+        raise OutputError(f"{file}: is a symbolic link instead of a regular file; remove it")
     return path
 
 

@@ -45,7 +45,7 @@ def cache_folder() -> Path:
         if not fault:
             return folders[0]
     base = _temporary_cache_folder()
-    LOG.warning("%s; caches are in %s instead; set XDG_CACHE_HOME to a permanent folder", fault, base)
+    LOG.warning("%s; using %s for caches instead; set XDG_CACHE_HOME to a permanent folder", fault, base)
     os.environ["XDG_CACHE_HOME"] = str(base)  # all libraries and child processes read it
     if user_cache_folders():
         os.environ["POCL_CACHE_DIR"] = str(base / "pocl")

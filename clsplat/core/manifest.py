@@ -57,7 +57,7 @@ class Manifest:
     def require_listed(self, path: Path) -> None:
         """Raise DataError if a file exists that no tool wrote."""
         if path.is_file() and not self.has_entry(path):
-            raise DataError(f"{path}: exists and was not made from this scene; use another folder, or remove the file")
+            raise DataError(f"{path}: exists, and was not created from this scene; use another folder, or remove it")
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()

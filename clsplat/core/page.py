@@ -40,7 +40,7 @@ def render(template: str, **values: Any) -> str:
 def require_complete(path: Path) -> None:
     """Raise DataError if a page cannot be read or is truncated."""
     if not read_file(path).rstrip().endswith(b"</html>"):
-        raise DataError(f"{path}: is truncated; make the page again")
+        raise DataError(f"{path}: is truncated; create the page again")
 
 
 def safe_charts(drawings: Iterable[str]) -> list[Markup]:

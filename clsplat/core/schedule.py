@@ -59,7 +59,7 @@ class Curve(Settings):
     def divide(self, factor: float) -> "Curve":
         """Return the curve with its values divided by a factor.  Raises ConfigError if it does not support that."""
         raise ConfigError(
-            f"{type(self).__name__}: cannot be rescaled to another number of steps; use a number or points"
+            f"{type(self).__name__}: cannot be rescaled to another number of steps; use a number or a list of points"
         )
 
 

@@ -204,7 +204,7 @@ class Variants:
 
 def _check_path(text: str) -> str:
     if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-        raise ValueError("expected a path; it contains a character that file names cannot have")
+        raise ValueError("expected a path; it contains a character that is not allowed in file names")
     return text
 
 

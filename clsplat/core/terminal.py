@@ -109,7 +109,7 @@ def logging_to(path: Path) -> Iterator[None]:
     only log a warning.
     """
     if path.exists() and not path.is_file():
-        raise OutputError(f"{path}: cannot be written (it is not a file); remove it, or use another folder")
+        raise OutputError(f"{path}: cannot be written (not a regular file); remove it, or use another folder")
     formatter = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
     header = logging.LogRecord(LOG.name, logging.DEBUG, __file__, 0, "clsplat %s", (full_version(),), None)
     with raising_output_error(path):

@@ -32,7 +32,7 @@ def require_rows(copies: int, old_rows: int) -> None:
     for name, rows in (("copies", copies), ("old_rows", old_rows)):
         if not 0 <= rows <= MAX_ROWS:
             bound = "0 or more" if rows < 0 else f"at most {MAX_ROWS}"
-            raise ValueError(f"{name}: expected a number of rows, {bound}, got {rows}")
+            raise ValueError(f"{name}: expected a row count of {bound}, got {rows}")
 
 
 def encode_outcomes(
@@ -95,7 +95,7 @@ class Edit:
     def survey(self) -> Survey:
         """The survey of the training views with the Gaussians before the edit.  Raises ConfigError without views."""
         if self._survey is None:
-            raise ConfigError("a rule needs training photos, and there are none; remove the rule")
+            raise ConfigError("a rule needs training photos, but there are none; remove the rule")
         return self._survey
 
     def at(self, schedule: Schedule) -> float:

@@ -35,7 +35,7 @@ Threshold = Annotated[Quantile | PixelQuantile | NonNegative, explain_schedule("
 
 
 def _raise_no_photographs(q: float) -> float:
-    raise ConfigError("a quantile of pixels needs training photos, and there are none; give a number")
+    raise ConfigError("a quantile of pixels needs training photos, but there are none; use a number")
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class Gltf:
         self.is_mip = False
         if unknown := [name for name in tree.get("extensionsRequired", []) if not SUPPORTED.fullmatch(name)]:
             names = first_few(list(map(quote, unknown)))
-            raise DataError(f"{path}: requires {names}, which clsplat cannot read; export it without that")
+            raise DataError(f"{path}: requires {names}, which clsplat cannot read; export it again without them")
         pairs = [(part, matrix) for mesh, matrix in self._meshes() for part in tree["meshes"][mesh]["primitives"]]
         self.primitives = [pair for pair in pairs if _has_gaussians(_extensions(pair[0]))]
         if not self.primitives:
@@ -134,7 +134,9 @@ class Gltf:
         self.is_mip |= splats.mode == "mip"
         self.spz_bytes += sum(table.nbytes for table in splats.parameters.values())
         if self.spz_bytes > 4 * max(RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # as much as a single SPZ
-            raise DataError(f"{self.path}: its SPZ data unpack to {self.spz_bytes} bytes; export it again")
+            raise DataError(
+                f"{self.path}: its SPZ data decompresses to {self.spz_bytes} bytes, too many; export it again"
+            )
         part, axes = splats.parameters, [LEFT_UP_FRONT, FLIP]
         position = self.tree["accessors"][_index(names["POSITION"])] if "POSITION" in names else {}
         if len(splats) and {"min", "max"} <= position.keys():
@@ -312,7 +314,7 @@ def _to_srgb(linear: NDArray[np.float64]) -> NDArray[np.float64]:
 def _index(value: Any) -> int:
     """Return an index, size, or offset unchanged.  Raises ValueError unless it is an integer of at least 0."""
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 40:
-        raise ValueError(f"expected a whole number from 0, got {quote(value)}")
+        raise ValueError(f"expected a whole number of at least 0, got {quote(value)}")
     return value
 
 

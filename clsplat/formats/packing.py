@@ -103,7 +103,7 @@ def decode(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int)
     width, height = size(path, name, data)
     if not min_pixels <= width * height <= max_pixels:
         raise DataError(
-            f"{path}: {name} has {width} x {height} px; expected {min_pixels} to {max_pixels} px for its numbers; "
+            f"{path}: {name} has {width} x {height} px; expected {min_pixels} to {max_pixels} px in total; "
             "export the file again"
         )
     try:

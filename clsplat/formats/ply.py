@@ -123,8 +123,8 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
                 pass
             case _:
                 raise DataError(
-                    f"{path}: line {number}: cannot read {quote(line.strip())}; expected a PLY header whose vertices "
-                    "have single numbers as properties: export it again"
+                    f"{path}: line {number}: cannot read {quote(line.strip())}; expected a PLY header whose vertex "
+                    "properties are scalars: export it again"
                 )
     if not form:
         raise DataError(f"{path}: the PLY header has no 'format ascii 1.0' or 'format binary_…'; export it again")
@@ -152,7 +152,7 @@ def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
         ) from error
     if len(table) < header.count:
         raise DataError(
-            f"{path}: expected {header.count} lines with vertices, found {len(table)}; the file is truncated: "
+            f"{path}: expected {header.count} lines of vertices, found {len(table)}; the file is truncated: "
             "copy or export it again"
         )
     return table
@@ -178,7 +178,7 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
     *preceding_elements, vertex = elements[: names.index("vertex") + 1]
     if lists := [element.name for element in preceding_elements if element.has_list]:
         raise DataError(
-            f"{path}: {quote(lists[0])}, with a list, comes before the vertices; export it with vertices first"
+            f"{path}: the element {quote(lists[0])} has a list and precedes the vertices; export it with vertices first"
         )
     properties = [name for name, _ in vertex.properties]
     if not properties or len(set(properties)) < len(properties):
@@ -385,7 +385,7 @@ def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     motion = find_motion_columns(names)
     if motion is None:
         raise DataError(
-            f"{path}: has only some properties of a motion; expected velocity_0..2, time_center, and log_duration, "
+            f"{path}: has only some of the motion properties; expected velocity_0..2, time_center, and log_duration, "
             "and none or all of acceleration_0..2, jerk_0..2, and turn_0..3; export it again"
         )
     return {**parameters, MOTION: _columns(vertices, motion)} if motion else parameters

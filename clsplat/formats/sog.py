@@ -139,7 +139,7 @@ def sog_files(path: Path) -> Iterator[Files]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             yield Files(path, archive, len(data))
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError, KeyError) as error:
-        raise DataError(f"{path}: a damaged ZIP ({quote(error)}); copy or export the file again") from error
+        raise DataError(f"{path}: a damaged ZIP file ({quote(error)}); copy or export the file again") from error
 
 
 PIXELS_PER_BYTE = 2  # largest accepted number of splats per byte of all images; real files have less than one
@@ -182,7 +182,7 @@ class _Sog:
         self.is_version_1 = "version" not in meta and isinstance(shape, list)
         version = 1 if self.is_version_1 else meta.get("version")
         if version not in (1, 2):
-            raise DataError(f"{path}: SOG of version {quote(version)}; expected 1 or 2; export it again")
+            raise DataError(f"{path}: SOG version {quote(version)}; expected 1 or 2; export it again")
         self.count = self._require_count("count", shape[0] if self.is_version_1 and shape else meta.get("count"))
         self.images = {name: self._data(name) for name in PARTS}
         require_plausible(path, self.count, files.size, MAX_DEGREE if "shN" in meta else 0)

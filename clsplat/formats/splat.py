@@ -73,7 +73,7 @@ def read_splat(path: Path) -> SplatFile:
         "sh_rest": np.zeros((len(rows), 0), np.float32),
     }
     if (rows["scale"] < 0).any() and not notes:
-        raise DataError(f"{path}: has scales below 0; expected {EXPECTED}; it may be of another format")
+        raise DataError(f"{path}: has scales below 0; expected {EXPECTED}; the file may be in another format")
     for note in notes:
         LOG.warning("%s: %s", path, note)
     return SplatFile(parameters)
@@ -94,7 +94,10 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     color = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
     warn_clipped(path, "splat", "colors from 0 to 1", outside_bytes(255 * color))
     if p["sh_rest"].shape[1]:
-        LOG.warning("%s: splat stores no spherical harmonics: colors do not depend on the view; other formats do", path)
+        LOG.warning(
+            "%s: .splat stores no SH coefficients, so colors do not depend on the view; other formats do",
+            path,
+        )
     rows["color"] = np.clip(np.rint(255 * color), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
     return write_bytes(path, rows[order].tobytes())

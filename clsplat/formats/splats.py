@@ -344,7 +344,7 @@ def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFi
 def require_in_range(path: Path, splats: SplatFile, name: str) -> None:
     """Raise DataError for values that the format `name` cannot store."""
     if message := too_large_message(splats.parameters):
-        raise DataError(f"{path}: {message}; {name} cannot store that: `clsplat convert MODEL OTHER.ply` drops them")
+        raise DataError(f"{path}: {message}; {name} cannot store these: `clsplat convert MODEL OTHER.ply` drops them")
 
 
 def require_static(path: Path, splats: SplatFile, name: str) -> None:
@@ -371,7 +371,7 @@ def require_memory(path: Path, count: int, degree: int = MAX_DEGREE) -> None:
     if free is not None and size > free:
         raise MemoryLimitError(
             f"{path}: declares {count:,} Gaussians, which take {size / 2**30:.1f} GiB of memory, but "
-            f"{free / 2**30:.1f} GiB are free; use a machine with more, or a smaller model"
+            f"{free / 2**30:.1f} GiB are free; use a machine with more memory, or a smaller model"
         )
 
 

@@ -104,11 +104,11 @@ class SpzHeader:
     def parse(cls, path: Path, data: bytes) -> "SpzHeader":
         """Parse the header in the first bytes of a file.  Raises DataError if it is invalid."""
         if len(data) < HEADER or data[:4] != MAGIC:
-            raise DataError(f"{path}: not an SPZ file, whose header has {HEADER} bytes; copy or export it again")
+            raise DataError(f"{path}: not an SPZ file with a header of {HEADER} bytes; copy or export it again")
         version, count, degree, fraction, flags = struct.unpack_from("<2I3B", data, 4)
         if not 1 <= version <= 4 or degree > STORED_DEGREE or fraction > 23:
             raise DataError(
-                f"{path}: SPZ of version {version}, SH degree {degree}, {fraction} fractional bits; expected version "
+                f"{path}: SPZ version {version}, SH degree {degree}, {fraction} fractional bits; expected version "
                 "1 to 4, degree 0 to 4, at most 23 bits; export it again"
             )
         return cls(version, count, degree, fraction, flags)
@@ -307,7 +307,7 @@ def _open_zstd(data: bytes) -> tuple[Any, type[Exception]]:
     try:
         import zstandard
     except ImportError as error:
-        raise ConfigError("SPZ of version 4 needs Zstandard; install it: pip install 'clsplat[spz]'") from error
+        raise ConfigError("SPZ version 4 needs Zstandard; install it: pip install 'clsplat[spz]'") from error
     return zstandard.ZstdDecompressor(max_window_size=1 << MAX_WINDOW).stream_reader(data), zstandard.ZstdError
 
 
@@ -381,7 +381,7 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
         require_content(path, data)  # says that it is compressed
     header = SpzHeader.parse(path, start)
     if header.version > 3:
-        raise DataError(f"{path}: SPZ of version 4 must use Zstandard, not gzip; export it again")
+        raise DataError(f"{path}: SPZ version 4 must use Zstandard, not gzip; export it again")
     _check_size(path, header, len(data) if data[:4] == MAGIC else min(len(data) * CODE_RATIO, _max_decoded_size(data)))
 
     def read(size: int) -> bytes:
@@ -457,8 +457,8 @@ def _decode_version_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, s
         length, unpacked = struct.unpack_from("<2Q", data, table_start + 16 * index)
         if unpacked != size or length > len(data) - start:
             raise DataError(
-                f"{path}: stream {index} declares {length} bytes for {unpacked}; expected {size} for {header.count} "
-                "splats, inside the file; copy or export it again"
+                f"{path}: stream {index} declares {length} bytes that decompress to {unpacked}; expected {size} for "
+                f"{header.count} splats, inside the file; copy or export it again"
             )
         frames.append(ZstdFrame(path, data[start : start + length], size))
         start += length

@@ -96,7 +96,7 @@ def _meta(path: Path) -> dict[str, Any]:
     meta = read_json(path, "a lod-meta.json", limit=MAX_META)
     if not isinstance(meta, dict) or meta.get("version") != 1:
         version = quote(meta.get("version") if isinstance(meta, dict) else meta)
-        raise DataError(f"{path}: streamed SOG of version {version}; expected 1; export it again")
+        raise DataError(f"{path}: streamed SOG version {version}; expected 1; export it again")
     names, counts = meta.get("filenames"), meta.get("counts")
     if not isinstance(names, list) or len({PureWindowsPath(_check_name(path, name)) for name in names}) < len(names):
         raise DataError(f"{path}: filenames is {quote(names)}; expected distinct file names; export it again")
@@ -115,7 +115,7 @@ def _meta(path: Path) -> dict[str, Any]:
 def _check_name(path: Path, name: Any) -> str:
     """Return the name of a meta.json below the folder unchanged.  Raises DataError if it is invalid."""
     if not isinstance(name, str) or not _is_meta_below(name):
-        raise DataError(f"{path}: names {quote(name)}; expected a {META} in a folder below; export it again")
+        raise DataError(f"{path}: names {quote(name)}; expected a {META} in a subfolder; export it again")
     return name
 
 

@@ -218,7 +218,7 @@ def read(path: Path, options: Reading | None = None) -> SplatFile:
         known_endings = ", ".join(endings(reads=True))
         raise DataError(f"{path}: unknown model format; expected one of {known_endings}")
     if codec.read is None:
-        raise DataError(f"{path}: {codec.name} can be written but not read; convert the model that it was made from")
+        raise DataError(f"{path}: {codec.name} can be written but not read; convert the model it was created from")
     with np.errstate(all="ignore"):  # values that are not finite are handled below
         return apply_not_finite(path, clamp_limits(path, codec.read(path, options), options), options)
 
@@ -229,12 +229,12 @@ def writing_format(path: Path) -> Codec:
     Raises ConfigError if there is none, and OutputError for an empty name.
     """
     if not path.name:
-        raise OutputError(f"{path}: cannot be written (it has no file name); give the path of a file")
+        raise OutputError(f"{path}: cannot be written (it has no file name); use the path of a file")
     codec = format_of_name(path)
     if codec is None or codec.write is None:
         remedy = f"is only written by `{codec.command}`" if codec and codec.command else "can be read but not written"
         fault = f"{codec.name} {remedy}" if codec else f"no format has the name {quote(path.name)}"
-        raise ConfigError(f"{shorten(str(path))}: {fault}; give a name that ends in {', '.join(endings())}")
+        raise ConfigError(f"{shorten(str(path))}: {fault}; use a name that ends in {', '.join(endings())}")
     return codec
 
 

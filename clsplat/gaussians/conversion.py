@@ -55,7 +55,7 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     for model, name in zip(models, names, strict=True):
         kinds = [_describe_filter(m) for m in (first, model)]
         if kinds[0] != kinds[1]:
-            raise DataError(f"{name}: is {kinds[1]}, but {names[0]} is {kinds[0]}; merge only models of one kind")
+            raise DataError(f"{name}: is {kinds[1]}, but {names[0]} is {kinds[0]}; merge only models of the same kind")
         values, first_values = model.rendering.comment(), first.rendering.comment()
         different_keys = [key for key in SHARED if values.get(key) != first_values.get(key)]
         if differences := [f"{key} = {values.get(key, 'not set')}" for key in different_keys]:
@@ -117,7 +117,7 @@ def writing_options(out: Path, quality: Quality, changes: Changes) -> Writing:
     if quality not in QUALITIES:
         raise ConfigError(f"--quality {quote(quality)}: expected one of {', '.join(QUALITIES)}")
     if quality != "balanced" and not writing_format(out).has_quality:
-        raise ConfigError(f"{out}: --quality is only for SPZ and SOG; give a name that ends in .spz or .sog")
+        raise ConfigError(f"{out}: --quality is only for SPZ and SOG; use a name that ends in .spz or .sog")
     return Writing(quality, world=changes.world)
 
 
@@ -129,7 +129,7 @@ def convert(
     Returns `file`, `format`, `gaussians`, `bytes`, and `bytes_read`.  Raises ConfigError, DataError, OutputError.
     """
     if not sources:
-        raise ConfigError("convert: give a model file to read and one to write")
+        raise ConfigError("convert: expected at least one model file to read, and one to write")
     check_output(sources, out)
     changes = changes or Changes()
     options = writing_options(out, quality, changes)
@@ -153,7 +153,7 @@ def write_model(sources: Sequence[Path], model: Model, out: Path, options: Writi
 def check_output(sources: Sequence[Path], out: Path) -> None:
     """Raise ConfigError if the output is one of the sources or belongs to a run."""
     if any(_is_same(out, model_path(source)) for source in sources):
-        raise ConfigError(f"{out}: is one of the input files; give another name")
+        raise ConfigError(f"{out}: is one of the input files; use another name")
     check_not_run_file(out)
 
 
@@ -239,7 +239,7 @@ def _extract_frame(model: Model, time: float) -> Model:
         raise ConfigError("the model does not move; omit --time and --frames")
     frame = model.at(time)
     if not len(frame):
-        raise DataError(f"none of {len(model):,} Gaussians is visible at time {time:g}; give another time")
+        raise DataError(f"none of {len(model):,} Gaussians is visible at time {time:g}; use another time")
     return frame
 
 
@@ -275,7 +275,7 @@ def convert_frames(
     if not 2 <= frames <= MAX_FRAMES:
         raise ConfigError(f"--frames {frames}: expected 2 to {MAX_FRAMES:,} frames; `--time T` writes one")
     if changes.time is not None:
-        raise ConfigError("--frames and --time: give only one of them")
+        raise ConfigError("--frames and --time cannot be combined; omit one of them")
     folder, prefix, suffix = _split_name(out)
     digits = max(4, len(str(frames - 1)))
     files = [folder / f"{prefix}{number:0{digits}}{suffix}" for number in range(frames)]
@@ -348,7 +348,7 @@ def _require_no_other_frames(folder: Path, names: re.Pattern[str], files: Sequen
         all_names = sorted(os.listdir(folder)) if folder.is_dir() else []
     if other_frames := [name for name in all_names if names.fullmatch(name) and name not in frame_names]:
         raise ConfigError(
-            f"{folder / other_frames[0]}: is not one of the {len(files):,} frames but looks like one; give a new name"
+            f"{folder / other_frames[0]}: is not one of the {len(files):,} frames, but named like one; use a new name"
         )
 
 
@@ -359,7 +359,7 @@ def _split_name(out: Path) -> tuple[Path, str, str]:
     codec = writing_format(out)
     ending = next((end for end in sorted(codec.endings, key=len, reverse=True) if out.name.lower().endswith(end)), "")
     if not ending.startswith("."):
-        raise ConfigError(f"{out}: --frames adds numbers to a name; give a folder, or a name such as frame.spz")
+        raise ConfigError(f"{out}: --frames adds numbers to a name; use a folder, or a name such as frame.spz")
     return out.parent, f"{out.name[: -len(ending)]}_", out.name[-len(ending) :]
 
 

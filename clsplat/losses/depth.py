@@ -35,9 +35,7 @@ class InverseDepth(ImageLoss):
         if weight == 0 or depths is None:
             return LossValue("inverse_depth", lambda: 0.0)
         if len(comparison.image.shape) != 3 or comparison.image.shape[0] < 4:
-            raise ConfigError(
-                "the loss inverse_depth needs a frame with the content 'inverse_depth'; render it with that content"
-            )
+            raise ConfigError("the loss inverse_depth needs a frame that was rendered with the content 'inverse_depth'")
         count = depths.pixels.shape[0]
         scale = weight * depths.extent / count
         terms = comparison.workspace.array("inverse_depth_terms", count)

@@ -49,7 +49,7 @@ class HostLoss(ImageLoss):
         if not (math.isfinite(value) and np.isfinite(derivative).all()):
             raise NumericError(
                 f"step {comparison.step}: the loss '{self.name}' returned values that are not finite; "
-                "expected finite numbers; look for a division by 0, or a root or logarithm of 0"
+                "look for a division by 0, or a root or logarithm of 0"
             )
         planes = comparison.gradient.get() if comparison.accumulate else np.zeros(comparison.gradient.shape, np.float32)
         planes[:3, :height, :width] += np.float32(weight) * derivative.transpose(2, 0, 1)

@@ -24,7 +24,7 @@ class PruneInvisible(Rule):
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
         if not gaussians.is_moving:
-            raise ConfigError(f"'{self.type}' needs Gaussians that move; set `model.time`, or remove '{self.type}'")
+            raise ConfigError(f"'{self.type}' needs moving Gaussians; set `model.time`, or remove '{self.type}'")
         timestamps = np.unique([view.time or 0.0 for view in edit.survey.views])
         motion = gaussians.get(MOTION)
         centers = motion[:, motion_fields(motion.shape[1])["time_center"]][:, 0]

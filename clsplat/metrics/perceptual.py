@@ -46,7 +46,7 @@ class Lpips:
                 f"{path}: not an ONNX file that OpenCV {cv2.__version__} can read ({_last_line(error)})"
             ) from error
         if (distance := self.distance(gray, gray)) != 0:
-            raise ConfigError(f"{path}: is not LPIPS; the distance of equal images is {distance:g}, expected 0")
+            raise ConfigError(f"{path}: not an LPIPS network; equal images have the distance {distance:g}, expected 0")
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
         """Return the distance of two images, [height, width, 3].  Raises ConfigError if the network rejects them."""
@@ -224,7 +224,7 @@ def _flip_package() -> ModuleType:
     try:
         import flip_evaluator
     except ImportError as error:
-        raise ConfigError("metric flip: needs a package; pip install 'clsplat[metrics]'") from error
+        raise ConfigError("metric flip needs an extra package: pip install 'clsplat[metrics]'") from error
     return flip_evaluator  # type: ignore[no-any-return]
 
 

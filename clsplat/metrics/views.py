@@ -342,7 +342,7 @@ def measure(
     for view in views if progress is None else progress:
         photograph = photographs.get(view)
         if photograph.empty:
-            LOG.warning("%s: not measured, since its mask excludes every pixel; check the mask", view.name)
+            LOG.warning("%s: not evaluated, since its mask excludes every pixel; check the mask", view.name)
             continue
         floats = render_floats(painter, photograph.camera, view.response)
         if finite:
@@ -362,7 +362,7 @@ def measure(
             empty_names.append(view.name)
     if empty_names:
         LOG.warning(
-            "almost nothing is drawn in %d of %s, such as %s; check that the model fits the cameras, and model.near",
+            "almost nothing is rendered in %d of %s, such as %s; check that the model fits the cameras, and model.near",
             *(len(empty_names), pluralize(len(views), "view"), quote(empty_names[0])),
         )
     flicker, psnrs = flicker_meter.flicker(), {result.view: result.psnr for result in results}
@@ -376,7 +376,7 @@ def measure(
 def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM) -> dict[str, Any]:
     """Average metrics over views, with the keys of metrics.json.  Raises DataError if there are no views."""
     if not results:
-        raise DataError("no view can be measured, since masks exclude all pixels; fix the masks")
+        raise DataError("no view can be evaluated, since masks exclude all pixels; fix the masks")
     return {
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),

@@ -57,7 +57,7 @@ class FieldModel:
 
     def __post_init__(self) -> None:
         if self.parameters.shape != (self.shape.parameters,):
-            raise ValueError(f"its parameters are {self.parameters.shape}; expected ({self.shape.parameters},)")
+            raise ValueError(f"its parameters have shape {self.parameters.shape}; expected ({self.shape.parameters},)")
         _ = self.shape.scene_units
         if self.origin.shape != (3,):
             raise ValueError(f"its origin has {len(self.origin)} numbers; expected 3")
@@ -70,7 +70,9 @@ class FieldModel:
         """Return the field if it has this origin.  Raises DataError otherwise, since a field cannot be moved."""
         if np.array_equal(self.origin, origin):
             return self
-        raise DataError(f"the field has the origin {self.origin}, the scene {origin}; give the scene it was trained on")
+        raise DataError(
+            f"the field has the origin {self.origin}, the scene has {origin}; use the scene of its training"
+        )
 
     def upload(self, device: Device) -> Field:
         """Copy the field and its background to a device."""
@@ -126,7 +128,7 @@ def load_field(path: str | Path) -> FieldModel:
 def _parse_field(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel:
     """Return the field that a file contains.  Raises DataError or ValueError."""
     if notes.get("format") != FORMAT or "shape" not in notes:
-        raise DataError(f"has the format {quote(str(notes.get('format')))}, or is not a field")
+        raise DataError(f"not a field, or of an unknown format, {quote(str(notes.get('format')))}")
     try:
         meta = Notes.model_validate(dict(notes))
     except ValidationError as error:

@@ -46,7 +46,7 @@ class GridShape(Settings):
         if self.finest < self.coarsest:
             raise ValueError(f"'finest' must be at least 'coarsest', {self.coarsest}; got {self.finest}")
         if self.levels == 1 and self.finest != self.coarsest:
-            raise ValueError("with one level, 'coarsest' and 'finest' must be equal; or use 2 or more levels")
+            raise ValueError("with one level, 'coarsest' and 'finest' must be equal; or use at least 2 levels")
         if self.entries & (self.entries - 1):
             raise ValueError(f"'entries' must be a power of 2, got {self.entries}")
         return self
@@ -155,7 +155,7 @@ class FieldShape(Settings):
         if self.skip is not None and self.skip >= self.depth - 1:
             raise ValueError(f"'skip' must be less than {self.depth - 1}, so that a layer follows, or null")
         if not self.degrees and self.grid is None:
-            raise ValueError("'degrees' must be larger than 0 without a 'grid': the network would read no position")
+            raise ValueError("'degrees' must be larger than 0 without a 'grid': the network needs a position as input")
         return self
 
     def with_unit(self, scene: Scene) -> "FieldShape":
@@ -169,7 +169,7 @@ class FieldShape(Settings):
     def scene_units(self) -> float:
         """The unit of the field, in scene units.  Raises ValueError if it is still 'auto'."""
         if self.unit == "auto":
-            raise ValueError("the unit of the field is 'auto'; use FieldShape.with_unit to choose it by a scene")
+            raise ValueError("the unit of the field is 'auto'; use FieldShape.with_unit to choose it from a scene")
         return self.unit
 
     @property

@@ -133,7 +133,7 @@ class Array:
         """Copy values of the same shape from the host.  Raises ValueError, MemoryLimitError, DeviceError."""
         host = np.ascontiguousarray(values, self.dtype)
         if host.shape != self.shape:
-            raise ValueError(f"cannot copy {host.shape} into {self.shape}")
+            raise ValueError(f"cannot copy an array of shape {host.shape} into a buffer of shape {self.shape}")
         if host.size:
             with self.device.raising_errors("a copy to the device"):
                 cl.enqueue_copy(self.device.queue, self.buffer, host)
@@ -290,7 +290,7 @@ def open_device(device: str | Device | None = None, schedule: Schedule = "auto")
     if not isinstance(device, Device):
         raise ConfigError(f"device: expected part of a device name, or a Device, got {type(device).__name__}")
     if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:
-        raise ConfigError(f"device: {device.text}; the settings need the {schedule} schedule: open the device with it")
+        raise ConfigError(f"device: {device.text}; the settings need the schedule {schedule}; open the device with it")
     return device
 
 

@@ -136,7 +136,7 @@ def choose(device_name: str | None = None) -> DeviceInfo:
         if fault is None:
             gpus = [device.text for device in devices if device.kind == info.kind == "GPU" and device is not info]
             if gpus:
-                LOG.info("chose %s; other GPUs: %s; --device NAME chooses one", info.text, "; ".join(gpus))
+                LOG.info("using %s; other GPUs: %s; select one with --device NAME", info.text, "; ".join(gpus))
             return info
         faults.append(f"{info.text} does not work: {fault}")
         LOG.warning("%s", faults[-1])
@@ -170,7 +170,7 @@ def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "s
     if schedule == "auto":
         return "wide" if info.kind == "CPU" and info.float_width >= 8 else "simt"
     if schedule not in ("wide", "simt"):
-        raise ConfigError(f"unknown schedule '{schedule}'; expected auto, wide or simt")
+        raise ConfigError(f"unknown schedule '{schedule}'; expected auto, wide, or simt")
     return schedule
 
 

@@ -43,7 +43,7 @@ def require_space() -> None:
     limit = process_limit("RLIMIT_FSIZE")
     if limit is not None and limit < MIN_FILE_SIZE:
         raise OutputError(
-            f"`ulimit -f` limits files to {limit >> 10} KiB; built kernels need {MIN_FILE_SIZE >> 10} KiB: raise it"
+            f"`ulimit -f` limits files to {limit >> 10} KiB; kernels need {MIN_FILE_SIZE >> 10} KiB: raise the limit"
         )
     if fault := _full_cache_fault():
         raise OutputError(fault)
@@ -71,7 +71,7 @@ def remove_cut_kernels() -> None:
         with suppress(OSError):
             file.unlink()
     if files:
-        LOG.warning("removed %d truncated files of built kernels (%s); they will be built again", len(files), files[0])
+        LOG.warning("removed %d truncated files from the kernel cache (%s); they will be rebuilt", len(files), files[0])
     with suppress(OutputError):
         write_text(record, state)
 

@@ -106,6 +106,6 @@ class ViewTable:
             rows = {"": np.array([np.nan])}
         if not all(np.isfinite(row).all() for row in rows.values()):
             raise DataError(
-                f"{path}: expected {len(self.columns)} finite numbers for each photo; train again, or remove it"
+                f"{path}: expected {len(self.columns)} finite numbers for each photo; train again, or remove the file"
             )
         return rows

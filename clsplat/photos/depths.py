@@ -50,7 +50,7 @@ class DepthMaps:
         files = FileLookup(self.folder, self.folder, new_names, _png_names, strict=True)
         for name, file in zip(new_names, files.paths, strict=True):
             if not file.is_file():
-                raise DataError(f"{file}: the depth map of {name} is missing; add it, or --set another folder")
+                raise DataError(f"{file}: the depth map of {name} is missing; add it, or set another folder with --set")
         self._files.update(zip(new_names, files.paths, strict=True))
 
     def read(self, name: str, width: int, height: int) -> Floats:

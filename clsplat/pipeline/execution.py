@@ -21,7 +21,7 @@ ENGINE = r"^(inline|local|(dask|tls)://[^/:\s]+:(\d{1,5}))$"
 LAST_PORT = 65_535
 LOOPBACK = ("127.0.0.1", "localhost")
 STORE_KEYS = ("devices", "placement", "retries")  # have an effect only with a store
-ON_ONLY = "a pipeline file may not set this; give it in a file with --on"
+ON_ONLY = "a pipeline file may not set this; set it in a file for --on"
 
 
 class Placement(Settings):
@@ -52,7 +52,7 @@ def _check_engine(value: Any) -> Any:
 
 def _check_local_engine(value: Any) -> Any:
     if isinstance(value, str) and not re.fullmatch(LOCAL_ENGINE, value):
-        raise ValueError("expected inline or local; give the address of a scheduler in a file with --on")
+        raise ValueError("expected inline or local; set the address of a scheduler in a file for --on")
     return value
 
 
@@ -77,7 +77,7 @@ class LocalExecution(Settings):
         """Raise ValueError for a key that has no effect but is not at its default."""
         for key, reason in self._unused_keys().items():
             if getattr(self, key) != type(self).model_fields[key].default:
-                raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; leave it out")
+                raise ValueError(f"{key} has no effect with engine {self.engine}: {reason}; omit it")
         return self
 
     def _unused_keys(self) -> dict[str, str]:

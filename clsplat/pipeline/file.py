@@ -201,7 +201,7 @@ class PipelineFile(Settings):
         for stage in self.stages:
             if isinstance(stage, Training):
                 return stage
-        raise ConfigError(f"{self.name}: expected a stage that trains, such as 'optimize'")
+        raise ConfigError(f"{self.name}: has no training stage; add one, such as 'optimize'")
 
     @property
     def optimize(self) -> Optimize:
@@ -209,4 +209,4 @@ class PipelineFile(Settings):
         for stage in self.stages:
             if isinstance(stage, Optimize):
                 return stage
-        raise ConfigError(f"{self.name}: expected a stage 'optimize'")
+        raise ConfigError(f"{self.name}: has no 'optimize' stage; add one")

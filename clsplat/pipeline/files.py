@@ -41,7 +41,7 @@ def variant_of(name: str, key: str) -> str:
     """Return the name or path of a variant, given those of its pipeline.  Raises ConfigError."""
     path = find(name)
     if key.encode() not in VARIANT_KEY.findall(origin(path).read_bytes()):
-        raise ConfigError(f"{name}: has no variant '{key}'; `photos` has one")
+        raise ConfigError(f"{name}: has no variant '{key}'; use a pipeline that has one, such as `photos`")
     return str(Path(name).with_stem(path.stem + ENDINGS[key]))
 
 
@@ -54,7 +54,7 @@ def find(name: str) -> Path:
         is_run = is_folder and (path / PIPELINE).is_file()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise ConfigError(f"{quote(name)}: not the name of a file ({reason})") from error
+        raise ConfigError(f"{quote(name)}: not a valid file name ({reason})") from error
     if is_file:
         return path
     if path.suffix in (".yaml", ".yml"):
@@ -66,7 +66,7 @@ def find(name: str) -> Path:
         return files[name]
     if is_run:
         raise ConfigError(
-            f"{path}: is a run folder; expected a pipeline; `clsplat resume {shell_quote(path)}` continues the run"
+            f"{path}: is a run folder, not a pipeline; `clsplat resume {shell_quote(path)}` continues the run"
         )
     if is_folder:
         remedy = f"to train on it, use `clsplat run splat_7k --scene {shell_quote(path)}`"

@@ -69,7 +69,7 @@ def _hash_content(path: Path) -> str:
     if not model.is_file() and any(is_image(file) for file in path.rglob("*")):
         return f"sha256:{fingerprint(path, path / 'nothing')}"
     if not model.is_file():
-        raise DataError(f"{path}: no model here; expected a file, or the folder of a finished run")
+        raise DataError(f"{path}: contains no model; expected a model file or the folder of a finished run")
     side_files = [file for file in (*model_files(model), sky_path(model)) if file != model and file.is_file()]
     digests = " ".join(map(_digest, (model, *side_files)))
     return f"sha256:{hashlib.sha256(digests.encode()).hexdigest() if side_files else digests}"

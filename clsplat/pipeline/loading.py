@@ -71,7 +71,7 @@ class Pipeline:
         settings, folder = self.settings, prepared_folder(out)
         if settings.prepare and settings.scene.masks is not None:
             raise ConfigError(
-                "scene.masks: masks do not fit photos before they are undistorted; run without scene.masks first, "
+                "scene.masks: the masks must fit the undistorted photos; run without scene.masks first, "
                 f"then use the scene in {folder} as --scene, with masks of its images"
             )
         return plan(settings.prepare, settings.scene.folder, folder) if settings.prepare else []
@@ -209,14 +209,16 @@ def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> Pip
         return settings
     keep, data, keys = adapt.keep, settings.model_dump(mode="json"), adapt.keys(settings.optimize)
     if unknown := [key for key in (*keep, *(decision.key for decision in adapt.decisions or ())) if key not in keys]:
-        raise ConfigError(f"adapt: {adapt.type} does not decide {quote(unknown[0])}; expected one of {', '.join(keys)}")
+        raise ConfigError(f"adapt: {adapt.type} does not set {quote(unknown[0])}; expected one of {', '.join(keys)}")
     for key in keys:
         try:
             key_path = apply(copy.deepcopy(data), f"{key}=null", PipelineFile)
         except OverrideError as error:
             raise ConfigError(f"adapt: {adapt.type}: {key}: {error.reason}") from error
         if key_path[0] not in ("model", "stages"):
-            raise ConfigError(f"adapt: {adapt.type}: {key} is used before the photos are measured")
+            raise ConfigError(
+                f"adapt: {adapt.type}: {key} cannot be adapted, since it is used before the photos are analyzed"
+            )
         if key not in keep and any(key_path[: len(path)] == path[: len(key_path)] for path in key_paths):
             keep = [*keep, key]
     decisions = adapt.decisions and [decision for decision in adapt.decisions if decision.key not in keep]
@@ -316,13 +318,12 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
         for need in sorted(stage.needs - available):
             makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
             if need in removed:
-                reason = f"which {removed[need]} removes (made again by {makers})"
+                reason = f"which {removed[need]} removes; add {makers} in between"
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', {reason}")
             if reason := _explain_late_stage(settings.stages[:i], need):
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {reason}")
-            raise ConfigError(
-                f"{path}: stages[{i}] {stage.stage} needs '{need}', which no earlier stage makes (made by {makers})"
-            )
+            reason = f"no earlier stage creates; add {makers} before it"
+            raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {reason}")
         removed |= dict.fromkeys(available & stage.removes, f"stages[{i}] {stage.stage}")
         available = (available - stage.removes) | stage.makes
         if isinstance(stage, Training):

@@ -76,7 +76,7 @@ class Matrix(Settings):
     def _check_axes(self) -> "Matrix":
         axes: list[list[Any]] = [self.pipelines, self.scenes, self.seeds, *self.set.values()]
         if not any(axes):
-            raise ValueError("expected one of pipelines, scenes, seeds and set")
+            raise ValueError("expected one of pipelines, scenes, seeds, and set")
         for axis in axes:
             if len({json.dumps(value) for value in axis}) < len(axis):
                 raise ValueError(f"duplicate value in {quote(axis)}")

@@ -123,9 +123,9 @@ class _Node:
         if name not in kinds:
             matches = difflib.get_close_matches(name, kinds, n=1)
             hint = f"; did you mean {matches[0]}?" if matches else ""
-            raise OverrideError(text, f"no {quote(name)}; expected one of {', '.join(kinds)}{hint}")
+            raise OverrideError(text, f"unknown type {quote(name)}; expected one of {', '.join(kinds)}{hint}")
         if value is not None and not isinstance(value, dict):
-            raise OverrideError(text, "expected a mapping of its keys, such as {}, or null")
+            raise OverrideError(text, "expected a mapping of keys to values, such as {}, or null")
         types = [item["type"] for item in self.data]
         index = types.index(name) if name in types else None
         if index is not None:

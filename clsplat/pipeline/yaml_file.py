@@ -94,7 +94,9 @@ def read_pipeline(path: Path) -> str:
 def _apply_variant(text: str, path: Path, file: Path, name: str) -> str:
     document = _parse(text, str(file))
     if not isinstance(document.data, dict) or not isinstance(document.data.get(name), dict):
-        raise ConfigError(f"{file}: expected a map '{name}', with values of {path.name}; add one, or run {file.name}")
+        raise ConfigError(
+            f"{file}: expected a mapping '{name}' with values for {path.name}; add one, or run {file.name}"
+        )
     root = YAML(typ="safe", pure=True).compose(text)
     summary, settings, edits = "", {}, []
     for key, variant in [pair for pair in root.value if pair[0].value in ENDINGS]:

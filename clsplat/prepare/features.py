@@ -70,7 +70,7 @@ def find_features(
     log_warnings(result)
     if camera_model != "EQUIRECTANGULAR" and all(_is_panorama(out / IMAGES / group[0]) for group in groups):
         LOG.warning(
-            "the photos are twice as wide as high, like panoramas; "
+            "the photos are twice as wide as they are high, like panoramas; "
             "for panoramas, use --set find_features.camera_model=EQUIRECTANGULAR"
         )
     if note := shared_camera_note(out / IMAGES, groups):

@@ -111,7 +111,7 @@ def map_cameras(
         except FAILURES as error:
             if not (attempt.wider or models):
                 raise
-            LOG.warning("skipping an attempt that failed: %s", error)
+            LOG.warning("skipping a failed attempt: %s", error)
             if not attempt.wider:
                 break
             extra_pairs, candidates = [], []

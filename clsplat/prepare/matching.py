@@ -141,7 +141,7 @@ def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
             return []
         if bad_names := [image.name for image in images if _has_space(image.name)]:
             LOG.warning(
-                "'%s': COLMAP's lists of pairs allow no spaces in names, so no further pairs are matched", bad_names[0]
+                "'%s': COLMAP's pair lists do not allow spaces in names, so no further pairs are matched", bad_names[0]
             )
             images = [image for image in images if not _has_space(image.name)]
         targets = [image.name in unplaced for image in images]
@@ -190,7 +190,7 @@ def _find_similar_pairs(pycolmap: ModuleType, database: Path, neighbors: int) ->
         descriptors = _descriptors(db, images)
     if bad_names := [image.name for image in images if _has_space(image.name)]:
         raise DataError(
-            f"'{bad_names[0]}': COLMAP's lists of pairs allow no spaces in names; rename it, or match all pairs"
+            f"'{bad_names[0]}': COLMAP's pair lists do not allow spaces in names; rename it, or match all pairs"
         )
     return [(images[i].name, images[j].name) for i, j in similar_pairs(descriptors, neighbors)]
 

@@ -87,7 +87,7 @@ class FindFeatures(Step):
 
     def check(self, source: Path, excluded_folder: Path) -> None:
         if is_scene(source):
-            raise DataError(f"{source}: already contains cameras; give a folder that contains only photos")
+            raise DataError(f"{source}: already contains cameras; use a folder that contains only photos")
         require_photographs(source, excluded_folder.resolve())
         require_pycolmap()
 

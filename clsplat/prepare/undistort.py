@@ -77,5 +77,5 @@ def _png_names(names: list[str]) -> list[str]:
     counts = Counter(candidates)
     unique_names = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(candidates, names, strict=True)]
     if len(set(unique_names)) < len(unique_names):
-        raise DataError(f"two images would be called '{Counter(unique_names).most_common(1)[0][0]}'; rename one")
+        raise DataError(f"two images would be named '{Counter(unique_names).most_common(1)[0][0]}'; rename one")
     return unique_names

@@ -115,7 +115,7 @@ class ModelSource:
             if not model.exists():
                 raise DataError(f"{model}: not found; expected a model file or a run folder")
             raise ConfigError(
-                f"{model}: a model file does not name its scene; give the folder of the scene, or a run folder"
+                f"{model}: a model file does not name its scene; pass the folder of the scene, or a run folder"
             )
         settings = load_pipeline(str(folder / PIPELINE)).settings.scene if folder is not None else SceneSettings()
         file = trained_file(model) if run == model else model
@@ -207,7 +207,7 @@ def photo_folder(scene: Path) -> Path:
     note = read_note(scene)
     folder = Path(note["folder"]) if note else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
     if not folder.is_dir():
-        raise DataError(f"{scene}: the folder of its photos, {folder}, is missing; give the folder of the scene")
+        raise DataError(f"{scene}: the folder of its photos, {folder}, is missing; pass the folder of the scene")
     return folder
 
 
@@ -304,12 +304,12 @@ def _check_folder(out: Path, paths: Sequence[Path], photographs: Sequence[Path])
     for images in {path.resolve().parent for path in photographs}:
         if folder == images or folder in images.parents or images in folder.parents:
             raise ConfigError(
-                f"{out}: is, contains, or is inside the folder of the photos, {images}; give another --out"
+                f"{out}: is, contains, or is inside the folder of the photos, {images}; use another --out"
             )
     renders = _read_record(out)
     for path in paths:
         if path_exists(path) and path.relative_to(out).as_posix() not in renders:
-            raise ConfigError(f"{path}: exists, and is not from an earlier render; give another --out")
+            raise ConfigError(f"{path}: exists, and is not from an earlier render; use another --out")
 
 
 def _read_record(out: Path) -> dict[str, bool]:

@@ -284,7 +284,7 @@ def _warn_about_near_plane(near: float | str, nearest: float | None) -> None:
     """Warn if the nearest points are in front of the near plane.  Both distances are in scene units."""
     if isinstance(near, float) and nearest is not None and nearest < near:
         LOG.warning(
-            "nothing nearer than model.near=%g scene units is drawn, but the nearest points of the training photos are "
+            "nothing nearer than model.near=%g scene units is rendered, but the nearest points of training photos are "
             "at %.3g; set model.near to %.2g",
             *(near, nearest, nearest / 2),
         )

@@ -131,7 +131,7 @@ def check_run_folder(state: RunState, start: Start) -> None:
     if start not in get_args(Start):
         raise ConfigError(f"start: expected one of {', '.join(get_args(Start))}, got '{start}'")
     if not _has_own_pipeline(state):
-        raise ConfigError(f"{out / PIPELINE}: was not written by a run, which would replace it; use another folder")
+        raise ConfigError(f"{out / PIPELINE}: was not written by a run, and would be overwritten; use another folder")
     if start == "new" and state.phase >= Phase.BEGUN:
         raise ConfigError(f"{out}: already has a run; use another folder, --resume, or --restart")
     if start != "resume":

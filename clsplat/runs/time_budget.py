@@ -160,7 +160,7 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, deadline:
     deadline: on the clock of `time.perf_counter`, s.  Raises ConfigError as soon as it is clear that the minimum number
     of steps does not fit.
     """
-    LOG.info("--minutes %g: rehearsing %s with %d steps", minutes, pipeline.settings.name, steps)
+    LOG.info("--minutes %g: timing %s with %d steps", minutes, pipeline.settings.name, steps)
     short_settings = stretch(pipeline.settings, Fraction(steps, pipeline.settings.training.steps))
     short_pipeline, start_time = replace(pipeline, settings=_add_reports(short_settings)), time.perf_counter()
     reports: list[tuple[float, int, float]] = []  # time on the clock, s; step; time of one step, s
@@ -227,7 +227,7 @@ def _require_single_training(pipeline: Pipeline) -> None:
     stages = [stage for stage in pipeline.stages if isinstance(stage, Training)]
     if len(stages) != 1:
         raise ConfigError(
-            f"{pipeline.path}: --minutes: expected one stage that trains, found {len(stages)}; leave --minutes out"
+            f"{pipeline.path}: --minutes: expected one stage that trains, found {len(stages)}; omit --minutes"
         )
     if isinstance(stages[0], ValidatedTraining) and stages[0].refit:
         raise ConfigError(

@@ -126,7 +126,7 @@ def verify(state: RunState) -> dict[str, Any]:
     """
     out = state.out
     if state.phase is Phase.EMPTY:
-        raise DataError(f"{out}: has neither pipeline.yaml nor status.json; expected the folder of a run")
+        raise DataError(f"{out}: has neither pipeline.yaml nor status.json; expected a run folder")
     cells: dict[str, RunState] = {}
     objects = list(_check_files(state, cells))
     bad_files = [entry["file"] for entry in objects if not entry["whole"]]
@@ -258,7 +258,7 @@ def check(pipeline: str) -> dict[str, Any]:
     if not state.phase and pipeline not in shipped_pipelines() and is_model(Path(pipeline)):
         return examine(Path(pipeline))
     if len(Path(pipeline).parts) > 1 and not path_exists(origin(Path(pipeline))):
-        raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or the folder of a run")
+        raise ConfigError(f"{pipeline}: no such file or folder; expected a pipeline, a model, or a run folder")
     if Path(pipeline).is_dir() and (state.phase or pipeline not in shipped_pipelines()):
         return verify(state)
     if experiment := load_experiment(pipeline):

@@ -87,7 +87,7 @@ def make_video(
     if target.kind not in KINDS:
         raise ConfigError(f"--format: expected {' or '.join(KINDS)}, got '{target.kind}'")
     if videos and target.kind != KINDS[0]:
-        raise ConfigError(f"--format {target.kind} is for images, and a video has 8 bits; leave --video out")
+        raise ConfigError(f"--format {target.kind} is for images, and a video has 8 bits; omit --video")
     if extras.side and not videos:
         raise ConfigError("--side needs --video, because images are written without a comparison; add --video FILE")
     content = _read(model)
@@ -150,7 +150,7 @@ def _make_side(
     assert scene is not None
     photo_views, extent = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
     if not photo_views:
-        raise ConfigError(f"--side {PHOTOGRAPH}: the scene {scene.path} has no photos; name a model instead")
+        raise ConfigError(f"--side {PHOTOGRAPH}: the scene {scene.path} has no photos; use a model instead")
 
     @lru_cache(maxsize=4)
     def photograph(index: int) -> Image:
@@ -232,8 +232,8 @@ def _warn_about_size(models_by_name: Mapping[str, Model], splats: int | None) ->
     for name, model in models_by_name.items():
         if min(len(model), splats or len(model)) > MANY_SPLATS:
             LOG.warning(
-                "%s: %s splats take long to pack, and browsers show only %s smoothly; --splats %d keeps the most "
-                "important ones",
+                "%s: %s splats take a long time to pack, and browsers show only %s smoothly; --splats %d keeps the "
+                "most important ones",
                 *(name, f"{len(model):,}", f"{MANY_SPLATS:,}", MANY_SPLATS),
             )
 

@@ -40,9 +40,9 @@ def with_image_names(scene: Scene) -> Scene:
     previous_names: set[str] = set()
     for name in names:
         if not name.isprintable() or name != name.strip():
-            raise DataError(f"{scene.path}: an image is called {quote(name)}; expected a name in one line of text")
+            raise DataError(f"{scene.path}: an image is named {quote(name)}; expected a name on a single line")
         if name in previous_names:
-            raise DataError(f"{scene.path}: two images would be called {quote(name)}; rename one")
+            raise DataError(f"{scene.path}: two images would be named {quote(name)}; rename one")
         previous_names.add(name)
     return scene.renamed(names)
 
@@ -230,7 +230,9 @@ def check_cameras(scene: Scene, format_: str) -> Scene:
     if len(view_by_model) > 1:
         model, name = view_by_model.popitem()
         first = next(iter(view_by_model))
-        raise DataError(f"{name}: is {model}, other views are {first}; nerfstudio allows one model per file; {REMEDY}")
+        raise DataError(
+            f"{name}: has the camera model {model}, other views have {first}; nerfstudio allows only one; {REMEDY}"
+        )
     return renamed_scene
 
 

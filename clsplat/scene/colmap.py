@@ -403,10 +403,12 @@ def find_models(path: Path) -> list[Path]:
 def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     models = [(folder, read_images(folder)) for folder in find_models(path)]
     if not models:
-        raise DataError(f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse or .")
+        raise DataError(
+            f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse, or ."
+        )
     best = max(models, key=lambda model: len(model[1]))
     if unused := ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0]):
-        logger.info("%s: the largest model, with %d images, is used; not used: %s", best[0], len(best[1]), unused)
+        logger.info("%s: using the largest model, with %d images; ignoring %s", best[0], len(best[1]), unused)
     return best
 
 

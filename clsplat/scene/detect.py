@@ -89,7 +89,7 @@ def find_dataset(path: Path) -> Reader | None:
     best = max(range(len(datasets)), key=lambda i: (has_images[i], len(names[i])))
     if sum(has_images) > 1 or not all(names[i] & names[best] for i in range(len(names))):
         candidates = first_few([f"{reader.folder.relative_to(path).as_posix()} ({reader.name})" for reader in datasets])
-        raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {candidates}; give one of these")
+        raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {candidates}; use one of these")
     datasets[best].choice = f", of {len(datasets)} models of these photos"
     return datasets[best]
 

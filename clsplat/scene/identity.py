@@ -95,7 +95,7 @@ def require_content(path: Path, views: Sequence[View], files: Mapping[Path, Imag
     blank = [view.name for view in views if view.image_path in files and files[view.image_path].blank]
     if blank and len(blank) == len(views):
         raise DataError(
-            f"{path}: no photo shows anything: {first_few(blank)} are black, of a single color, or transparent; "
+            f"{path}: all photos are blank: {first_few(blank)} are black, of a single color, or transparent; "
             "export them again"
         )
     return blank

@@ -56,7 +56,7 @@ def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError when some `files` of the dataset at `path` do not exist; the error names the first three."""
     paths = list(files)
     if missing := [str(file) for file in paths if not os.path.exists(file)]:  # unlike Path.exists, never raises
-        raise DataError(f"{path}: {_describe_missing(missing, len(paths))}; put them back")
+        raise DataError(f"{path}: {_describe_missing(missing, len(paths))}; restore them")
 
 
 def _describe_missing(missing: Sequence[str], count: int) -> str:
@@ -221,7 +221,7 @@ class FileLookup:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
             if missing == "refuse" or not rows:
                 skip_advice = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
-                raise DataError(f"{fault}{self.hint}; put them back{skip_advice}")
+                raise DataError(f"{fault}{self.hint}; restore them{skip_advice}")
             logger.warning("%s%s; the scene is read without them", fault, self.hint)
         return rows
 

@@ -89,7 +89,7 @@ def _frames(path: Path) -> dict[str, list[Path]]:
     if videos:
         folder = videos[0].with_suffix("")
         raise DataError(
-            f"{videos[0]}: is a video without a folder {folder} of its frames; make the folder, and write them, for "
+            f"{videos[0]}: has no folder {folder} with its frames; create the folder and extract the frames, for "
             f"example with `ffmpeg -i {shell_quote(videos[0])} -r 10 {shell_quote(folder / '%04d.png')}`"
         )
     if not frames:
@@ -141,5 +141,5 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
             f"NAME.png of each camera among the poses, or remove {VIDEOS}/{missing[0]}"
         )
     if len(views) > len(cameras):
-        LOG.info("%s: left out %d images of cameras without frames in %s", path, len(views) - len(cameras), VIDEOS)
+        LOG.info("%s: skipped %d images of cameras without frames in %s", path, len(views) - len(cameras), VIDEOS)
     return cameras, points

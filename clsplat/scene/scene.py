@@ -117,7 +117,7 @@ class Scene:
         test: the names of the test views.  Raises DataError like make_scene, and for an unknown name.
         """
         if unknown_names := set(test) - {view.name for view in views}:
-            raise DataError(f"test: no view is called {quote(min(unknown_names))}; expected names of views")
+            raise DataError(f"test: no view is named {quote(min(unknown_names))}; expected names of views")
         test_indices = {i for i, view in enumerate(views) if view.name in test}
         return make_scene(IN_MEMORY, list(views), test_indices, points, background)
 
@@ -176,8 +176,8 @@ class Scene:
         for downscale in downscales:
             if downscale < smallest:
                 raise DataError(
-                    f"{self.path}: the largest images have 1/{smallest:g} of their full size; "
-                    f"expected 1/{downscale:g}: raise the downscale to {smallest:g}"
+                    f"{self.path}: the largest images are downscaled by {smallest:g}, "
+                    f"more than by {downscale:g}; raise it to {smallest:g}"
                 )
             source = downscale if downscale in self.downscales else smallest
             for name, indices in splits.items():
@@ -241,7 +241,7 @@ def make_scene(
     names: set[str] = set()
     for view in views:
         if view.name in names:
-            raise DataError(f"{path}: two images are called {quote(view.name)}; rename one")
+            raise DataError(f"{path}: two images are named {quote(view.name)}; rename one")
         names.add(view.name)
         try:
             view.camera.check()
@@ -251,7 +251,7 @@ def make_scene(
     points = points if points and len(points) else None
     origin = choose_origin(views, points)
     if origin.any():
-        LOG.info("%s: coordinates are far from zero; those of the run are relative to %s", path, position_text(origin))
+        LOG.info("%s: coordinates are far from zero; the run uses %s as the origin", path, position_text(origin))
         views = [view.shifted(origin) for view in views]
         points = points and replace(points, positions=points.positions - origin)
     color = WHITE if background == "white" else BLACK

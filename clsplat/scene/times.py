@@ -48,8 +48,8 @@ def make_clock(path: object, moments: Sequence[tuple[str, float | None]]) -> Clo
         return None
     if names := [name for name, value in moments if value is None]:
         raise DataError(
-            f"{path}: {len(names)} of {len(moments)} frames have no `time`: {first_few(names)}; expected a time in "
-            "every frame or in none: add the missing ones, or remove all for a static scene"
+            f"{path}: {len(names)} of {len(moments)} frames have no `time`: {first_few(names)}; "
+            "add the missing times, or remove all times for a static scene"
         )
     first, last = min(values), max(values)
     if not (math.isfinite(last - first) and last > first):

@@ -29,7 +29,7 @@ def read_times(folder: Path) -> dict[str, float] | None:
         return None
     table = read_json(path, "timestamps of photos in JSON", limit=LARGEST)
     if not isinstance(table, dict):
-        raise DataError(f"{path}: expected a table with a number for each photo, by name")
+        raise DataError(f"{path}: expected a JSON object that maps the name of each photo to a number")
     for name, value in table.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
             raise DataError(

@@ -95,7 +95,7 @@ class Transforms:
         self.table = read_json(path, "cameras in JSON", limit=MAX_BYTES)
         frames = self.table.get("frames") if isinstance(self.table, dict) else None
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise DataError(f"{path}: expected a table with a list of tables called `frames`; export it again")
+            raise DataError(f"{path}: expected a JSON object with a list of objects named `frames`; export it again")
         if len(frames) > MAX_FRAMES:
             raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: split the scene")
         self.frames = [JsonFrame(path.parent, f"{path}: frames[{i}]", row, self.table) for i, row in enumerate(frames)]
@@ -281,7 +281,7 @@ def read_pose(frame: JsonFrame) -> Floats:
         matrix[:3, :3] /= np.cbrt(max(np.linalg.det(matrix[:3, :3]), MIN_SCALE**3))  # some exporters keep a scale
     if not is_finite or not _is_rotation(matrix[:3, :3]):
         raise DataError(
-            f"{frame.source}: transform_matrix is not 4x4 numbers with a rotation in its corner; "
+            f"{frame.source}: transform_matrix is not a 4x4 matrix with a rotation in its top left corner; "
             "remove that frame or export the file again"
         )
     camera_to_world = np.eye(4)
@@ -366,7 +366,7 @@ class NerfstudioReader(Reader):
             test = {views[i].name for i in every_nth([view.name for view in views], holdout)}
         split_views = views if train is None else [view for view in views if view.name in train | (test or set())]
         if len(split_views) < len(views):
-            logger.info("%s: left out %d images that no split lists", transforms.path, len(views) - len(split_views))
+            logger.info("%s: skipped %d images that no split lists", transforms.path, len(views) - len(split_views))
         return files.scene(path, split_views, test or set(), transforms.points(clock))
 
     def list_parts(self, parts: Parts) -> None:
@@ -428,7 +428,7 @@ def _frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
     table = splits.get(name) if isinstance(splits, dict) else None
     columns: list[Any] = [table.get(column) for column in COLUMNS] if isinstance(table, dict) else [None]
     if not all(isinstance(column, list) for column in columns) or len(set(map(len, columns))) > 1:
-        raise DataError(f"{path}: '{name}' needs lists of equal length called {', '.join(COLUMNS)}; make it again")
+        raise DataError(f"{path}: '{name}' needs lists of equal length named {', '.join(COLUMNS)}; create it again")
     if len(columns[0]) > MAX_FRAMES:
         raise DataError(f"{path}: '{name}' has {len(columns[0])} images; expected at most {MAX_FRAMES}")
     frames = []
@@ -438,7 +438,7 @@ def _frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
         level = frame.number("label")
         if level is None or not 0 <= level <= 8 or level % 1:
             raise DataError(
-                f"{frame.source}: label is {quote(label)}; expected how often it was halved, 0 to 8: make it again"
+                f"{frame.source}: label is {quote(label)}; expected the number of halvings, 0 to 8: create it again"
             )
         frames.append(frame)
     return frames

@@ -295,7 +295,7 @@ def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDA
     """
     is_file = path != NO_FILE
     if not is_file and view.image is None:
-        raise DataError(f"the view {quote(view.name)} has no photo; expected one with an image or an image_path")
+        raise DataError(f"the view {quote(view.name)} has no photo; set its image or image_path")
     images: dict[bool, NDArray[Any]] = {}
 
     def size(upright: bool) -> Size:

@@ -27,7 +27,7 @@ NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
 def _require_text(value: Any) -> Any:
     if not isinstance(value, str):
-        raise ValueError("expected names of photos as text: put numbers in quotes, as in '0042'")
+        raise ValueError("expected names of photos as strings: put numbers in quotes, as in '0042'")
     if not value.strip():
         raise ValueError("expected names of photos, none of them empty")
     return value
@@ -63,7 +63,7 @@ class ViewSelection(Settings):
             raise ValueError(f"{NOTATIONS} (YAML needs a space after each colon)")
         offset = value.get("offset")
         if isinstance(offset, int) and offset < 0:
-            raise ValueError(f"expected an offset of 0 or more, not {quote(offset)}")
+            raise ValueError(f"expected an offset of 0 or more, got {quote(offset)}")
         if "offset" in value and len(value) == 1:
             raise ValueError("'offset' needs 'every', as in {every: 8, offset: 4}")
         return value
@@ -194,7 +194,7 @@ def _require_one_match(name: str, matches: Sequence[int], names: Sequence[str], 
         return matches
     if matches:
         candidates = " and ".join(quote(names[i]) for i in matches[:2])
-        raise MissingViewError(f"{source}: {quote(name)} matches {candidates}; give more of the path")
+        raise MissingViewError(f"{source}: {quote(name)} matches {candidates}; use a longer part of the path")
     raise _unknown_name_error(name, names, source)
 
 
@@ -202,7 +202,7 @@ def _unknown_name_error(name: str, names: Sequence[str], source: str) -> DataErr
     similar = get_close_matches(name, [*names, *(PurePosixPath(name).name for name in names)], 1)
     hint = f"the first is {quote(names[0])}: correct or remove the name"
     hint = f"did you mean {quote(similar[0])}?" if similar else hint
-    return MissingViewError(f"{source}: no photo is called {quote(name)}; {hint}")
+    return MissingViewError(f"{source}: no photo is named {quote(name)}; {hint}")
 
 
 # Split a scene into training, validation and test views.
@@ -238,13 +238,13 @@ class Split:
             test = _select(scene, "holdout", holdout, names, folders, {"missing": scene.skipped})
             if len(test) == len(names):
                 raise DataError(
-                    f"{scene.path}: scene.holdout takes all {len(names)} photos for testing; name fewer, "
+                    f"{scene.path}: scene.holdout selects all {len(names)} photos for testing; name fewer, "
                     "or raise `every`, to leave some for training"
                 )
             if not test:
                 remedy = "lower its offset" if holdout.every else "name photos that are there"
                 raise DataError(
-                    f"{scene.path}: scene.holdout takes 0 of {len(names)} photos for testing; expected some: "
+                    f"{scene.path}: scene.holdout selects 0 of {len(names)} photos for testing; expected some: "
                     f"{remedy}, or set scene.holdout to 0 for none"
                 )
             scene = _with_test(scene, test)
@@ -301,7 +301,7 @@ class Split:
         train = tuple(i for i in scene.train if i not in fold)
         if not fold or not train:
             raise DataError(
-                f"{scene.path}: scene.validation takes {len(fold)} of {len(scene.train)} training photos; "
+                f"{scene.path}: scene.validation selects {len(fold)} of {len(scene.train)} training photos; "
                 "expected some of them, not all"
             )
         return replace(scene, train=train, validation=tuple(sorted(fold)))
@@ -353,7 +353,7 @@ def _validation_fold(scene: Scene) -> set[int]:
     if count < MIN_TRAIN:
         raise DataError(
             f"{scene.path}: has {pluralize(count, 'training photo')}; expected at least {MIN_TRAIN} to hold "
-            "some out for validation: take more, or set scene.validation to 0"
+            "some out for validation: add photos, or set scene.validation to 0"
         )
     fold = order[FOLD_OFFSET::FOLD]
     fold = fold if len(fold) > 1 else [order[count // 4], order[3 * count // 4]]

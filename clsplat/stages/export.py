@@ -76,7 +76,7 @@ class Export(Scheduled):
                 if writing_format(file).read:
                     load(file, Reading(quiet=True))
             except DataError as error:
-                raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
+                raise OutputError(f"{error}; the file was just written: check the disk and its free space") from error
             LOG.debug("%s written to %s", size_text(len(model), None, len(exported_model) - len(model)), file)
         run.model_hashes.pop(_name(sky_path, run), None)
         if sky_path.is_file():

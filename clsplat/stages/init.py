@@ -128,7 +128,7 @@ class Init(Stage):
 
     def check(self) -> None:
         if self.source == "model" and self.file is None:
-            raise ConfigError("init.file: 'source: model' needs a model file or the folder of a run; set 'file'")
+            raise ConfigError("init.file: 'source: model' needs a model file or a run folder; set 'file'")
 
     def check_run(self, run: Run) -> None:
         require_times(run.scene, run.model_settings.time)

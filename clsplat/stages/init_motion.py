@@ -24,7 +24,7 @@ def require_times(scene: Scene, motion: Motion | None) -> None:
             "its views have no timestamps" if len(untimed) == len(scene.views) else f"{untimed[0]} has no timestamp"
         )
         raise DataError(
-            f"{scene.path}: {problem}, which `model.time` needs; give a timestamp for each photo "
+            f"{scene.path}: {problem}, which `model.time` needs; add a timestamp for each photo "
             "(docs/moving.md), or use a pipeline for static scenes, such as splat_7k"
         )
 

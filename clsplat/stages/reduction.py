@@ -36,7 +36,7 @@ class Crop(Stage):
         rows = np.flatnonzero(self.inside.shifted(run.scene.origin).contains(gaussians.get("means")))
         if not len(rows):
             raise EmptyRegionError(
-                f"crop: none of the {gaussians.count:,} Gaussians is inside the box; give a larger box"
+                f"crop: none of the {gaussians.count:,} Gaussians is inside the box; use a larger box"
             )
         change = keep_rows(gaussians, rows, self.stage)
         run.refresh_filter()
@@ -79,7 +79,7 @@ class PruneLeast(Scheduled):
     @model_validator(mode="after")
     def _check_fraction(self) -> "PruneLeast":
         if (self.keep is None) == (self.remove is None):
-            raise ValueError("give either 'keep' or 'remove', a fraction of the Gaussians")
+            raise ValueError("set either 'keep' or 'remove' to a fraction of the Gaussians, not both")
         return self
 
     def stale(self, run: Run) -> Collection[str]:
@@ -134,7 +134,7 @@ class ReduceSh(Scheduled):
         gaussians.set("sh_rest", np.where(expand_bands(is_dropped.reshape(energy.shape)), 0, rest))
         if run.adam is not None:
             run.adam.reset_moments("sh_rest")
-        LOG.info("%d of %d bands of harmonics are zero", is_dropped.sum(), is_dropped.size)
+        LOG.info("%d of %d SH bands are zero", is_dropped.sum(), is_dropped.size)
 
 
 def compute_band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -175,5 +175,5 @@ class ExportField(Stage):
         try:
             load_field(file)
         except DataError as error:
-            raise OutputError(f"{error}; it was just written: check the disk and its free space") from error
+            raise OutputError(f"{error}; the file was just written: check the disk and its free space") from error
         LOG.info("wrote a field with %s parameters to %s", f"{field.shape.parameter_count:,}", file)

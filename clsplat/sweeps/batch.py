@@ -58,7 +58,7 @@ def has_result(source: Path, target: Path) -> bool:
         copied_hash = read_json(target / MANIFEST)["files"][PIPELINE]
     if copied_hash and try_sha256(target / PIPELINE) not in (None, copied_hash):
         raise ConfigError(
-            f"{target}: the run was continued with other settings after the sweep; move that folder away, "
+            f"{target}: the run was continued with other settings after the sweep; move that folder elsewhere, "
             "and run the sweep again with --resume"
         )
     state = RunState.read(target)
@@ -261,7 +261,7 @@ def run_one(
         experiment = Experiment(single_pipeline.path, single_pipeline.settings.name, "", cells)
     elif index is None or not 0 <= index < len(experiment.cells):
         last_index = len(experiment.cells) - 1
-        raise ConfigError(f"{pipeline}: is a matrix; give the number of a cell, --index 0 to {last_index}")
+        raise ConfigError(f"{pipeline}: is a matrix; select a cell with --index 0 to {last_index}")
     matrix_cell = experiment.cells[index or 0]
     store, stop, has_started = Store(root), threading.Event(), threading.Event()
     with stopping_on_signals(lambda: ask_to_stop(stop, has_started)):

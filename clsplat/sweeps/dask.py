@@ -222,7 +222,7 @@ class Cluster:
             yield
         except Exception as error:  # its type depends on when the scheduler ended
             if isinstance(error, OSError) or self._client.status in ("closing", "closed"):
-                raise DeviceError("the scheduler ended; start it, and run the sweep again with --resume") from error
+                raise DeviceError("the scheduler exited; restart it, and run the sweep again with --resume") from error
             raise
 
     def start(self, cell: CellRun, slot: DeviceSlot, options: CellOptions) -> Ticket:
@@ -251,7 +251,7 @@ class Cluster:
         while self._pending and time.monotonic() < deadline:
             time.sleep(0.1)
         if self._pending:
-            LOG.warning("some cells did not end in %.0f s", STOP_TIMEOUT_S)
+            LOG.warning("some cells did not finish within %.0f s", STOP_TIMEOUT_S)
         with self.settings:
             self._client.close()
             if self._cluster:

@@ -116,7 +116,7 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
         values = read_json(cache_file)
         if isinstance(values, dict) and isinstance(values.get("bits"), str):
             return str(values["bits"])
-    LOG.info("%s: running a short test to find devices that give the same bits", info.text)
+    LOG.info("%s: running a short test to find devices that produce the same bits", info.text)
     bits = _hash_fixed_run(device_query(info, infos))
     with suppress(OutputError):
         write_text(cache_file, json.dumps({"bits": bits, "device": info.text}) + "\n")
@@ -138,7 +138,7 @@ def _run_command(device: str, *arguments: str) -> None:
     """Run a `clsplat` command of the fixed run.  Raises DeviceError if it fails."""
     result = run_module("clsplat", *arguments, seconds=RUN_TIMEOUT_S)
     if result.code is None:
-        raise DeviceError(f"{device}: the test run did not end within {RUN_TIMEOUT_S:.0f} s")
+        raise DeviceError(f"{device}: the test run did not finish within {RUN_TIMEOUT_S:.0f} s")
     if result.code:
         lines = result.output.strip().splitlines()
         raise DeviceError(f"{device}: the test run failed: {lines[-1] if lines else result.code}")

@@ -144,7 +144,7 @@ class Job:
             previous, current = state.status.get("store"), STORE if experiment.execution.has_store else None
             if previous not in (None, current):
                 raise ConfigError(
-                    f"{state.out}: was started with --on; its cells are in {shorten(str(previous))}; give --on again"
+                    f"{state.out}: was started with --on; its cells are in {shorten(str(previous))}; pass --on again"
                 )
         if state:
             return cls(experiment or load(pipeline, edits), state, start)
@@ -170,7 +170,7 @@ class Job:
         state = RunState.read(out)
         if PIPELINE not in state.names:
             hint = f"; run its `clsplat run … --out {shell_quote(out)} --resume` again" if STATUS in state.names else ""
-            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a run that has started{hint}")
+            raise DataError(f"{out}: has no pipeline.yaml; expected the folder of a started run{hint}")
         if steps is not None:
             overrides = [*overrides, f"{state.steps_key}={steps}"]
             with suppress(ConfigError):  # which opening the run raises again

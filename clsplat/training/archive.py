@@ -55,7 +55,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
         raise
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes, such as EOFError and TokenError
         if isinstance(error, OSError) and error.errno not in DAMAGE:
-            raise OutputError(f"{path}: cannot be read ({error.strerror}); check disk and permissions") from error
+            raise OutputError(f"{path}: cannot be read ({error.strerror}); check the disk and permissions") from error
         if isinstance(error, DataError):
             raise
         is_empty = isinstance(error, zipfile.BadZipFile) and path.stat().st_size == 0
@@ -63,7 +63,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
             (error.strerror if isinstance(error, OSError) else "") or one_line(error) or type(error).__name__
         )
         if isinstance(error, OSError) and error.errno == errno.EIO:
-            raise DataError(f"the disk cannot read it: {error.strerror}") from error
+            raise DataError(f"it cannot be read from disk: {error.strerror}") from error
         raise DataError("is empty" if is_empty else f"does not match its checksum ({reason})") from error
 
 
@@ -91,14 +91,14 @@ def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
     if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
         raise DataError("its contents are compressed or encrypted")
     if sum(max(member.file_size, member.compress_size) for member in members) > size:
-        raise DataError(f"it declares more bytes than the {size} of the file")
+        raise DataError(f"it declares more bytes than the file has, {size}")
 
 
 def _notes(archive: zipfile.ZipFile) -> Notes:
     """Read the notes and check them against their SHA-256."""
     data = archive.read(f"{META}.npy")
     if hashlib.sha256(data).hexdigest() != str(_array(archive.read(f"{META_DIGEST}.npy"))):
-        raise DataError("its notes do not match their checksum")
+        raise DataError("its metadata does not match its checksum")
     notes = json.loads(str(_array(data)))
     if not isinstance(notes, dict) or DIGESTS not in notes:
         raise DataError("its checksums are missing")

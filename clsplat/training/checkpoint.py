@@ -100,7 +100,7 @@ def check_tables(state: State, tables: Arrays) -> None:
     count = len(tables["means"])
     for name, table in tables.items():
         if table.dtype != np.float32 or table.ndim != 2 or len(table) != count:
-            raise DataError(f"{name} is not [{count}, components] of float32")
+            raise DataError(f"{name} is not a float32 array [{count}, components]")
     if count == 0:
         raise DataError("it has no Gaussians")
     parameters = [*PARAMETERS, *([MOTION] if MOTION in tables else [])]
@@ -136,7 +136,7 @@ def check_modules(scalars: Mapping[str, Scalars], tables: Arrays) -> None:
         saved_tables, tables = split(tables, f"{name}/")
         module_class(name).check_saved(scalars[name], saved_tables)
     if tables:
-        raise DataError(f"it has tables of modules that its notes do not list: {', '.join(tables)}")
+        raise DataError(f"it has tables of modules that its metadata does not list: {', '.join(tables)}")
 
 
 def reload_modules(run: Run, scalars: Mapping[str, Scalars], tables: Arrays) -> None:
@@ -325,7 +325,7 @@ def load(path: Path) -> tuple[State, Arrays]:
     if type(notes.get("format")) is int and notes["format"] != FORMAT:
         raise ConfigError(
             f"{path}: has format {notes['format']}, expected {FORMAT}; resume it with the version that wrote it, "
-            "or give another --out"
+            "or use another --out"
         )
     try:
         state = State.model_validate(notes)
@@ -349,7 +349,7 @@ def _check_metrics(metrics: Metrics) -> None:
     values = [x for average in averages for name, x in average.items() if not re.search("_reason$|lpips_", name)]
     is_complete = all(average.get(name) is not None for average in averages for name in ("psnr", "ssim", "views"))
     if not (metrics.keys() <= set(SPLITS) and is_complete and all(isinstance(x, int | float | None) for x in values)):
-        raise DataError("its metrics are not those of a run")
+        raise DataError("its metrics are not valid metrics of a run")
 
 
 def restore(run: Run) -> tuple[Path | None, list[str]]:
@@ -365,7 +365,9 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
             state, tables = load(path)
         except DataError as error:
             if path == paths[0]:
-                raise OutputError(f"{path} is damaged ({error}), and so are all others; {restart}") from error
+                raise OutputError(
+                    f"{path} is damaged ({error}), and so are all other checkpoints; {restart}"
+                ) from error
             LOG.warning("%s is damaged (%s); using an earlier one", path, error)
             continue
         changes = _record_changes(run, path, state)
@@ -375,7 +377,7 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
         _restore(run, state, tables)
         return path, remarks
     if last := run.status.now.checkpoint:
-        raise OutputError(f"{run.out / CHECKPOINTS}: {last} is missing; put it back, or {restart}")
+        raise OutputError(f"{run.out / CHECKPOINTS}: {last} is missing; restore it, or {restart}")
     return None, []
 
 
@@ -459,7 +461,7 @@ def _record_changes(run: Run, path: Path, state: State) -> list[str]:
         if difference.stage is not None and difference.stage < state.stage_index:
             raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
         if state.best and state.best.refit == "begun" and difference.key_path.endswith((".steps", ".patience")):
-            raise ConfigError(f"{path} is of a refit, whose steps were chosen by validation: {difference}; {remedy}")
+            raise ConfigError(f"{path} is from a refit, whose steps were chosen by validation: {difference}; {remedy}")
         is_end = difference.key_path.endswith(".steps")  # an earlier end of the training
         if difference.stage == state.stage_index and state.is_trained(run.pipeline) and not is_end:
             advice = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` trains longer with it"

@@ -34,7 +34,11 @@ def make_room(run: Run, count: int) -> None:
             return
         reason = f", since the device can hold only {capacity:,} Gaussians with harmonics"
     gaussians.move_to_host()
-    LOG.info("step %d: harmonics move to the host%s; training slows down, with the same bits", run.step, reason)
+    LOG.info(
+        "step %d: moving SH coefficients to the host%s; training slows down, but its bits stay the same",
+        run.step,
+        reason,
+    )
 
 
 def device_capacity(run: Run, needed: float = math.inf) -> int:

@@ -126,7 +126,7 @@ class Page:
             limit = self.max_splats
             remedy = f"only the {limit:,} most important splats (--splats {limit}), or " if limit else ""
             raise OutputError(
-                f"{path}: the page would have {self.size:.0f} MB, and browsers open at most {MAX_SIZE:.0f} MB; show "
+                f"{path}: the page would be {self.size:.0f} MB, and browsers open at most {MAX_SIZE:.0f} MB; show "
                 f"{remedy}fewer photos (--photographs, --photograph-budget)"
             )
         write_text(path, self.text())

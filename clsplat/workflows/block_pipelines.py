@@ -54,7 +54,7 @@ def require_divisible(pipeline: Pipeline) -> None:
         if is_set:
             raise ConfigError(f"{pipeline.path}: {key} cannot be used with blocks: {remedy}")
     if not (isinstance(first_stage, Init) and first_stage.source == "model" and optimize_stages):
-        raise ConfigError(f"{pipeline.path}: start with `init: {{source: model}}`, and add a stage 'optimize'")
+        raise ConfigError(f"{pipeline.path}: expected `init: {{source: model}}` first, and an 'optimize' stage")
 
 
 def block_pipeline(

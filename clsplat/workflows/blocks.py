@@ -136,7 +136,7 @@ class Blocks:
         )
         if self.coarse_file and plan.coarse_overrides:
             raise ConfigError(
-                "--set-coarse changes the training of the coarse model; leave it out, or give a pipeline as --coarse"
+                "--set-coarse changes the training of the coarse model; omit it, or pass a pipeline as --coarse"
             )
         rasterizer = self.pipeline.settings.rasterizer
         self.device = open_verified(device, rasterizer.schedule, rasterizer.sort)

@@ -179,17 +179,17 @@ def _require_same_identity(out: Path, identity: dict[str, Any], record: str, con
     """Raise ConfigError if a folder has a record of other inputs, or has files but no record."""
     if not path_exists(out / record):
         if path_exists(out) and not (out.is_dir() and all(_is_leftover(path.name) for path in out.iterdir())):
-            raise ConfigError(f"{out}: contains files that are not part of {content}; give {remedy}")
+            raise ConfigError(f"{out}: contains files that are not part of {content}; use {remedy}")
         return
     try:
         previous = read_json(out / record)
     except DataError:
         previous = None
     if not isinstance(previous, dict):
-        raise ConfigError(f"{out / record}: is not the record of {content}; remove {out} or give {remedy}")
+        raise ConfigError(f"{out / record}: is not the record of {content}; remove {out}, or use {remedy}")
     changed_keys = [LABELS.get(key, key) for key, value in identity.items() if previous.get(key) != value]
     if changed_keys:
-        raise ConfigError(f"{out}: has {content} that differs in {', '.join(changed_keys)}; remove it or give {remedy}")
+        raise ConfigError(f"{out}: has {content} that differs in {', '.join(changed_keys)}; remove it, or use {remedy}")
 
 
 def _is_leftover(name: str) -> bool:
@@ -208,7 +208,7 @@ class Measurer:
         self.split = "test" if model.scene.split("test") else "train"
         if self.split == "train":
             LOG.warning(
-                "%s: has no test views, so the training views are measured; scene.holdout sets views aside for testing",
+                "%s: has no test views, so the training views are evaluated; hold out test views with scene.holdout",
                 model.scene.path,
             )
         self.rasterizer = Rasterizer(model.device)

@@ -252,9 +252,9 @@ def _open_model(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> 
         if run is None or (photo_error := _photo_error(run)) is None:
             raise
         if plan.steps != 0:
-            raise DataError(f"{photo_error} (give --scene DIR, or --steps 0 to merge without photos)") from error
+            raise DataError(f"{photo_error} (pass --scene DIR, or --steps 0 to merge without photos)") from error
         gaussians = _without_photos(model, plan, device, "its photos cannot be read")
-        LOG.warning("%s; levels are merged without training, and are not measured", photo_error)
+        LOG.warning("%s; levels are merged without training, and are not evaluated", photo_error)
         return None, gaussians
     return photo_model, photo_model.gaussians.baked()
 
@@ -264,7 +264,7 @@ def _without_photos(model: Path, plan: LodPlan, device: Any, reason: str) -> Mod
     gaussians = load(model).baked()
     options = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
     if names := ", ".join(name for name, value in options.items() if value):
-        raise ConfigError(f"{model}: {reason}, which {names} needs; give --scene, or leave {names} out")
+        raise ConfigError(f"{model}: {reason}, which {names} needs; pass --scene, or omit {names}")
     return gaussians
 
 

@@ -89,7 +89,7 @@ def _split_box(means: Floats, weights: Floats, box: Box, count: int) -> list[Par
     position = _round(quantile(means[:, axis], weights, count_below / count))
     is_below = means[:, axis] < position
     if is_below.all() or not is_below.any() or not (weights[is_below].any() and weights[~is_below].any()):
-        raise DataError(f"{pluralize(len(means), 'Gaussian')} cannot be split into {count} blocks; give fewer --blocks")
+        raise DataError(f"{pluralize(len(means), 'Gaussian')} cannot be split into {count} blocks; use fewer --blocks")
     halves = ((is_below, "high", count_below), (~is_below, "low", count - count_below))
     return [
         cell

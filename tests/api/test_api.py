@@ -159,7 +159,7 @@ def test_hand_made_scene_is_for_rendering_only(device, rng):
     renderer = Renderer(model, device)
     assert [renderer.render(view).image.shape for view in scene.split("all")] == [(32, 48, 3)] * 3
     assert "<img" not in scene._repr_html_()
-    with pytest.raises(DataError, match="by hand: the view '1' has no image, which training needs"):
+    with pytest.raises(DataError, match="by hand: the view '1' has no image; training needs one per view"):
         clsplat.Trainer(scene, "smoke", device=device)
 
 

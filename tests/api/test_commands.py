@@ -144,7 +144,7 @@ def test_views_of_other_kinds_and_splits_are_refused(runs, tmp_path, arguments, 
 
 
 def test_comparison_without_runs_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match=r"^no runs to compare; give the folder of at least one run$"):
+    with pytest.raises(ConfigError, match=r"^no runs to compare; pass at least one run folder$"):
         clsplat.compare_runs([], tmp_path / "c.html")
     assert not (tmp_path / "c.html").exists()
 
@@ -183,5 +183,5 @@ def test_functions_raise_the_errors_of_the_commands(call, error, message):
 
 
 def test_render_of_size_zero_is_refused(few_steps, tmp_path):
-    with pytest.raises(DataError, match="raise the downscale to 1"):
+    with pytest.raises(DataError, match="raise it to 1"):
         clsplat.render_views(few_steps, out=tmp_path / "out", downscale=0)

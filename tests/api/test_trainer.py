@@ -102,7 +102,7 @@ def test_float_image_keeps_the_levels_of_8_bits():
 
 def test_unknown_test_view_is_refused():
     view = clsplat.View("a", clsplat.Camera(5, 4, 5, 5, 2.5, 2), np.eye(4)[:3])
-    with pytest.raises(DataError, match="no view is called 'b'"):
+    with pytest.raises(DataError, match="no view is named 'b'"):
         clsplat.Scene.from_views([view], test=["b"])
 
 
@@ -237,7 +237,7 @@ def test_untrainable_input_is_one_sentence(tiny_scene, arguments, error, message
 
 
 def test_recipes_that_prepare_scenes_are_refused(tiny_scene):
-    with pytest.raises(ConfigError, match="prepares its scene; use clsplat"):
+    with pytest.raises(ConfigError, match="has `prepare` steps; use clsplat"):
         clsplat.Trainer(tiny_scene / "train", "photos")
 
 
@@ -249,7 +249,7 @@ def test_missing_or_occupied_folders_are_refused(tiny_scene, tmp_path):
         clsplat.Trainer(tiny_scene, "smoke", out=tmp_path / "run")
     no_training = tmp_path / "no.yaml"
     no_training.write_text("name: no\nstages: [init, export]\n")
-    with pytest.raises(ConfigError, match="expected a stage 'optimize'"):
+    with pytest.raises(ConfigError, match="has no 'optimize' stage; add one"):
         clsplat.Trainer(tiny_scene, no_training)
 
 

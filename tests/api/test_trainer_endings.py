@@ -66,7 +66,7 @@ def test_trainer_has_ended_after_an_error_inside_a_step(tiny_scene):
         ValueError, match=r"the loss returned a gradient of shape \(3,\); expected that of the image, \(40, 40, 3\)"
     ):
         trainer.run(2)
-    with pytest.raises(ClsplatError, match="ended with an error; create another, with start='resume'"):
+    with pytest.raises(ClsplatError, match="ended with an error; create a new one, with start='resume'"):
         trainer.run(2)
 
 

@@ -100,7 +100,7 @@ NEAR = {
     "render x --split tset": "invalid value for '--split'",
     "check lodout": "no pipeline named 'lodout', and no such file or folder; `clsplat pipelines` lists pipelines",
     "run smoke --scene x --set steps=3": "--set steps=3: no key 'steps' at the top of a pipeline; did you mean",
-    "resume nowhere": "nowhere: has no pipeline.yaml; expected the folder of a run",
+    "resume nowhere": "nowhere: has no pipeline.yaml; expected the folder of a started run",
     "status nowhere": "nowhere: has no readable status.json; expected a run folder",
     "pipelines --copy x": "--copy needs the name of a pipeline",
     "evaluate x.ply": "x.ply: not found; expected a model file or a run folder",
@@ -205,7 +205,7 @@ def test_run_folder_without_model_is_explained(finished, tmp_path):
     text = (run / "pipeline.yaml").read_text()
     (run / "pipeline.yaml").write_text(text.replace(str(load(str(run / "pipeline.yaml")).settings.scene.path), "gone"))
     missing = clsplat("render", run, expect=3).stderr
-    assert "the folder of its photos, gone, is missing; give the folder of the scene" in missing
+    assert "the folder of its photos, gone, is missing; pass the folder of the scene" in missing
     (run / "point_cloud.ply").unlink()
     assert (
         f"has no point_cloud.ply; finish the run with `clsplat resume {run}`" in clsplat("render", run, expect=3).stderr

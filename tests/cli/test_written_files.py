@@ -49,11 +49,11 @@ def test_renders_replace_only_renders(finished, tmp_path):
 @pytest.mark.parametrize(
     ("before", "name", "expected"),
     [
-        (["compare", "RUN", "--out"], "point_cloud.ply", "give a file name that ends in .html"),
+        (["compare", "RUN", "--out"], "point_cloud.ply", "use a file name that ends in .html"),
         (["compare", "RUN", "--out"], "report.html", "is a file of a run"),
-        (["inspect", "SCENE", "--html"], "point_cloud.ply", "give a file name that ends in .html"),
+        (["inspect", "SCENE", "--html"], "point_cloud.ply", "use a file name that ends in .html"),
         (["inspect", "SCENE", "--html"], "report.html", "is a file of a run"),
-        (["evaluate", "RUN", "--out"], "point_cloud.ply", "give a file name that ends in .json"),
+        (["evaluate", "RUN", "--out"], "point_cloud.ply", "use a file name that ends in .json"),
         (["evaluate", "RUN", "--out"], "metrics.json", "is a file of a run"),
     ],
 )

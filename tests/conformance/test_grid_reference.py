@@ -104,5 +104,5 @@ def test_invalid_grid_is_refused(keys, complaint):
 
 
 def test_network_without_any_position_is_refused():
-    with pytest.raises(ValidationError, match="read no position"):
+    with pytest.raises(ValidationError, match="needs a position"):
         FieldShape(degrees=0)

@@ -76,7 +76,7 @@ def test_caches_move_if_home_or_library_cache_is_read_only(machine, user_folder,
     (record,) = caplog.records  # once
     assert record.levelno == logging.WARNING
     assert str(machine / place) in record.getMessage()
-    assert f"caches are in {user_folder} instead" in record.getMessage()
+    assert f"using {user_folder} for caches instead" in record.getMessage()
 
 
 @linux
@@ -88,7 +88,7 @@ def test_caches_move_where_built_kernels_do_not_fit(machine, user_folder, monkey
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free.get(folder, 2**30)))
     assert cache_folder() == user_folder / "clsplat"
     assert (
-        f"{full}: has only 256 KiB of free space, too little for built kernels; caches are in {user_folder}"
+        f"{full}: has only 256 KiB of free space, too little for built kernels; using {user_folder} for caches"
         in caplog.text
     )
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=2**18))
@@ -158,7 +158,7 @@ def test_device_works_without_a_home(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "state     works" in done.stdout
     assert done.stderr.count("\n") == 1
-    assert "caches are in" in done.stderr
+    assert "for caches instead" in done.stderr
 
 
 @linux
@@ -217,7 +217,7 @@ def test_only_truncated_kernels_are_removed(machine, caplog):
     assert files.keys() - left == {*cut, kernel("", "empty")}
     assert {file.name.split("-")[-2] for file in pytools.iterdir()} == {"invoker", "new", "v5"}
     (record,) = caplog.records
-    assert record.getMessage().startswith("removed 7 truncated files of built kernels (")
+    assert record.getMessage().startswith("removed 7 truncated files from the kernel cache (")
     remove_cut_kernels()
     assert len(caplog.records) == 1
 

@@ -247,7 +247,7 @@ def test_threads_can_write_the_same_file(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have names on POSIX systems")
 def test_only_regular_files_are_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(OutputError, match=r"pipe: cannot be written \(it is not a file\)"):
+    with pytest.raises(OutputError, match=r"pipe: cannot be written \(not a regular file\)"):
         write_text(tmp_path / "pipe", "text")
     assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
     assert [path.name for path in tmp_path.iterdir()] == ["pipe"]

@@ -179,7 +179,7 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
     with pytest.raises(OutputError, match="is in use by this process; close that run or trainer first"):
         clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", start="resume")
     first.close()
-    with pytest.raises(clsplat.errors.ClsplatError, match="is closed; create another"):
+    with pytest.raises(clsplat.errors.ClsplatError, match="is closed; create a new one"):
         first.step()
     second = clsplat.Trainer(tiny_scene, "smoke", set=few, out=tmp_path / "run", start="resume")
     assert second.run().step == 3

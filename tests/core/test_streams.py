@@ -223,7 +223,7 @@ def test_full_log_disk_is_reported_once_and_stops_nothing(tmp_path, capsys):
 def test_log_that_is_not_a_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "log.txt") if hasattr(os, "mkfifo") else (tmp_path / "log.txt").mkdir()
     with (
-        pytest.raises(OutputError, match=r"log.txt: cannot be written \(it is not a file\)"),
+        pytest.raises(OutputError, match=r"log.txt: cannot be written \(not a regular file\)"),
         terminal.logging_to(tmp_path / "log.txt"),
     ):
         pass

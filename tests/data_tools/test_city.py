@@ -51,5 +51,5 @@ def test_views_are_evenly_spaced_above_the_city(count: int) -> None:
 def test_replacing_a_different_city_is_refused(folder: Path) -> None:
     assert "already complete" in write_dataset(folder, TINY)
     for other in (City(size=16, train=4, test=1, lots=4), SyntheticOptions(size=16, train=4, test=1)):
-        with pytest.raises(DataError, match="holds another dataset"):
+        with pytest.raises(DataError, match="contains another dataset"):
             write_dataset(folder, other)

@@ -88,7 +88,7 @@ def test_missing_frames_of_a_video_are_reported(video, tmp_path):
     record = tmp_path / "frames" / ".frames.json"
     record.write_text(json.dumps({**json.loads(record.read_text()), "chosen": [0, 10**6]}))
     (tmp_path / "frames" / "frame_00002.png").unlink()
-    with pytest.raises(DataError, match="names frame 1000000, which the video does not have"):
+    with pytest.raises(DataError, match="lists frame 1000000, which is not in the video"):
         write_frames(video, tmp_path / "frames", frames=2)
 
 
@@ -110,7 +110,7 @@ def test_frames_of_another_video_or_other_settings_do_not_mix(video, tmp_path, m
     (tmp_path / "w.avi").write_bytes(video.read_bytes() + b"more")
     asked = {"video": video, "frames": 4, "long_side": None, **more}
     message = refusal(write_frames, tmp_path / asked["video"], tmp_path / "frames", asked["frames"], asked["long_side"])
-    assert f"holds frames that were extracted with another {next(iter(more))}; use another folder" in message
+    assert f"contains frames that were extracted with another {next(iter(more))}; use another folder" in message
     assert {path.name: path.read_bytes() for path in (tmp_path / "frames").iterdir()} == before
 
 
@@ -121,7 +121,7 @@ def test_frames_do_not_mix_with_images_of_the_user(video, tmp_path):
     cv2.imwrite(str(image), np.zeros((4, 4, 3), np.uint8))
     kept = image.read_bytes()
     message = refusal(write_frames, video, tmp_path / "frames", 4)
-    assert "already holds 1 other images, such as frame_00001.png" in message
+    assert "contains 1 other images, such as frame_00001.png" in message
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["below", "notes.txt"]
     assert image.read_bytes() == kept
 

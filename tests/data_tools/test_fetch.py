@@ -149,6 +149,6 @@ def test_unfetchable_data_is_refused(web, tmp_path):
     (folder / "page.html").write_text("hello")
     assert "the server sent 404" in refusal(quietly, WebArchive(f"{address}/none.zip", ""), tmp_path / "d")
     assert "expected a ZIP or TAR archive" in refusal(quietly, WebArchive(f"{address}/page.html", ""), tmp_path / "d")
-    with pytest.raises(ConfigError, match="no dataset is called 'garden'; use one of mipnerf360"):
+    with pytest.raises(ConfigError, match="no dataset is named 'garden'; use one of mipnerf360"):
         find_source("garden")
     assert not (tmp_path / "d").exists()

@@ -160,7 +160,7 @@ def test_finished_data_set_is_not_rebuilt(dataset: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in dataset.rglob("*")}
     assert "already complete" in write_dataset(dataset, TINY)
     assert before == {p: p.stat().st_mtime_ns for p in dataset.rglob("*")}
-    with pytest.raises(DataError, match="holds another dataset"):
+    with pytest.raises(DataError, match="contains another dataset"):
         write_dataset(dataset, SyntheticOptions(size=24, train=4, test=2, seed=1))
 
 

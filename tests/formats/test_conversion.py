@@ -198,10 +198,10 @@ def test_invalid_option_is_refused_before_writing(option, text, source, tmp_path
         (
             "b.glb",
             {"quality": "small"},
-            r"b\.glb: --quality is only for SPZ and SOG; give a name that ends in \.spz or ",
+            r"b\.glb: --quality is only for SPZ and SOG; use a name that ends in \.spz or ",
         ),
         ("b.compressed.ply", {}, "compressed PLY can be read but not written"),
-        ("b.xyz", {}, r"no format has the name 'b.xyz'; give a name that ends in \.ply, "),
+        ("b.xyz", {}, r"no format has the name 'b.xyz'; use a name that ends in \.ply, "),
         ("b.ply", {"sh_degree": 4}, "expected 0 to 3"),
         ("b.spz", {"quality": "best"}, "--quality 'best': expected one of small, balanced, high"),
     ],
@@ -225,7 +225,7 @@ def test_inputs_are_not_overwritten(source, tmp_path, rng):
         ([tmp_path / "b.ply", source], source),
         (tmp_path / "f", tmp_path / "f" / "meta.json"),
     ]:
-        with pytest.raises(ConfigError, match="is one of the input files; give another name"):
+        with pytest.raises(ConfigError, match="is one of the input files; use another name"):
             clsplat.convert(sources, out, sh_degree=0)
     assert source.read_bytes() == data
     assert (tmp_path / "link.ply").is_symlink()
@@ -284,7 +284,7 @@ def test_values_beyond_any_codebook_are_refused_or_dropped(table, value, tmp_pat
     told = f"2 of 20 Gaussians have {table} beyond 1e+15"
     (tmp_path / "out").mkdir()
     for place in ("a.sog", "meta.json"):
-        with pytest.raises(DataError, match=re.escape(f"{told}; SOG cannot store that: `clsplat convert MODEL OTHER")):
+        with pytest.raises(DataError, match=re.escape(f"{told}; SOG cannot store these: `clsplat convert MODEL OTHER")):
             write(tmp_path / "out" / place, large)
     assert list((tmp_path / "out").iterdir()) == []
     result = clsplat.check(tmp_path / "a.ply")

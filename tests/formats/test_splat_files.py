@@ -57,7 +57,7 @@ def test_data_lost_in_splat_is_reported(tmp_path, rng, caplog):
     source.parameters["sh_base"][4:7] = -3
     write(tmp_path / "a.splat", source)
     assert "splat stores colors from 0 to 1; values of 3 Gaussians were clipped" in caplog.text
-    assert "splat stores no spherical harmonics" in caplog.text
+    assert "splat stores no SH coefficients" in caplog.text
 
 
 def test_text_of_numbers_is_not_a_splat(tmp_path):
@@ -159,5 +159,5 @@ def test_damaged_ksplat_is_refused(fault, tmp_path):
 
 
 def test_ksplat_is_not_written(tmp_path, rng):
-    with pytest.raises(ConfigError, match=r"ksplat can be read but not written; give a name that ends in .ply, "):
+    with pytest.raises(ConfigError, match=r"ksplat can be read but not written; use a name that ends in .ply, "):
         write(tmp_path / "a.ksplat", splats(rng, 3))

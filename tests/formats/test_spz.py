@@ -254,7 +254,7 @@ REFUSED = {
     "checksum of bytes": (b"\x1f\x8b\x08\0\0\0\0\0\0\xff\xff\xff\xff", "in gzip"),
     "plain and short": (legacy(3)[:-1], "more than it can contain|too short"),
     "plain and long": (legacy(2) + b"a", "has data after its 2 splats"),
-    "header": (b"NGSP\4\0\0\0", "whose header has 16 bytes"),
+    "header": (b"NGSP\4\0\0\0", "with a header of 16 bytes"),
 }
 
 

@@ -165,7 +165,7 @@ def test_folder_in_use_is_refused(tmp_path, monkeypatch):
     (tmp_path / "link").symlink_to("empty")
     monkeypatch.chdir(tmp_path / "here")
     for place in (*(tmp_path / name for name in ("used", "file", "link")), Path()):
-        with pytest.raises(ConfigError, match="already exists; give a new folder"), new_folder(place):
+        with pytest.raises(ConfigError, match="already exists; use a new folder"), new_folder(place):
             pytest.fail("the work begins")
 
 
@@ -219,7 +219,7 @@ def test_values_beyond_sog_are_refused_and_boxes_stay_finite(tmp_path, rng):
     json.loads((tmp_path / "a" / "lod-meta.json").read_text(), parse_constant=lambda text: pytest.fail(text))
     large.parameters["log_scales"][7] = 3e38
     write(tmp_path / "a.ply", large)
-    told = r"1 of 50 Gaussians have log_scales beyond 1e\+15; SOG cannot store that"
+    told = r"1 of 50 Gaussians have log_scales beyond 1e\+15; SOG cannot store these"
     with pytest.raises(DataError, match=told):
         write_lod(tmp_path / "b", [large])
     with pytest.raises(DataError, match=told):
@@ -237,18 +237,18 @@ def test_environment_is_part_of_the_model(written, rng):
 
 
 WRONG = {
-    "another version": ({"version": 2}, "of version 2; expected 1"),
+    "another version": ({"version": 2}, "version 2; expected 1"),
     "no names": ({"filenames": None}, "filenames is None"),
     "a name twice": ({"filenames": ["0_0/meta.json", "0_0/meta.json"]}, "distinct file names"),
-    "a name that leads out": ({"filenames": ["../meta.json"]}, "expected a meta.json in a folder below"),
-    "an absolute name": ({"filenames": ["/etc/meta.json"]}, "expected a meta.json in a folder below"),
-    "a NUL in a name": ({"filenames": ["0_0/meta.json", "\0/meta.json"]}, "expected a meta.json in a folder below"),
+    "a name that leads out": ({"filenames": ["../meta.json"]}, "expected a meta.json in a subfolder"),
+    "an absolute name": ({"filenames": ["/etc/meta.json"]}, "expected a meta.json in a subfolder"),
+    "a NUL in a name": ({"filenames": ["0_0/meta.json", "\0/meta.json"]}, "expected a meta.json in a subfolder"),
     "a name that is no text": (
         {"filenames": ["0_0/meta.json", "\ud800/meta.json"]},
-        "expected a meta.json in a folder",
+        "expected a meta.json in a subfolder",
     ),
-    "a name of 5,000 letters": ({"filenames": [f"{'a' * 5000}/meta.json"]}, "expected a meta.json in a folder below"),
-    "a name of another file": ({"filenames": ["0_0/lod-meta.json"]}, "expected a meta.json in a folder below"),
+    "a name of 5,000 letters": ({"filenames": [f"{'a' * 5000}/meta.json"]}, "expected a meta.json in a subfolder"),
+    "a name of another file": ({"filenames": ["0_0/lod-meta.json"]}, "expected a meta.json in a subfolder"),
     "no such file": (
         {"filenames": [f"{i}_9/meta.json" for i in range(20)]},
         "_9/meta.json: cannot be read (No such file",

@@ -170,5 +170,5 @@ def test_scene_display_has_four_images_and_escaped_names(tiny_scene):
 
 @pytest.mark.parametrize("path", ["", ".", "/"])
 def test_path_without_a_name_is_refused(rng, path):
-    with pytest.raises(OutputError, match=r"cannot be written \(it has no file name\); give the path of a file$"):
+    with pytest.raises(OutputError, match=r"cannot be written \(it has no file name\); use the path of a file$"):
         model_of(random_case(rng, 3)).save(path)

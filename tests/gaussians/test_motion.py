@@ -45,7 +45,7 @@ def test_partial_motion_is_refused(tmp_path):
     moving_model(8).save(tmp_path / "model.ply")
     data = (tmp_path / "model.ply").read_bytes().replace(b"float acceleration_1\n", b"float acceleration_9\n")
     (tmp_path / "model.ply").write_bytes(data)
-    with pytest.raises(DataError, match="only some properties of a motion"):
+    with pytest.raises(DataError, match="only some of the motion properties"):
         load(tmp_path / "model.ply")
 
 

@@ -195,7 +195,7 @@ def test_gaussians_with_large_scores_are_pruned_late(device, rng):
 @on_devices("rule", [RevertGrowth(), PruneSampled(), PruneInaccurate()])
 def test_rules_without_images_raise_an_error(device, rng, rule: Rule):
     gaussians = random_case(rng, 4).model(device).gaussians
-    with pytest.raises(ConfigError, match="needs training photos, and there are none"):
+    with pytest.raises(ConfigError, match="needs training photos, but there are none"):
         rule.mark(Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3))
 
 

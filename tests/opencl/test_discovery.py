@@ -65,8 +65,8 @@ def test_other_gpus_are_named_in_one_line(set_devices, caplog):
     with caplog.at_level(logging.INFO, "clsplat"):
         choose()
     assert [record.message for record in caplog.records] == [
-        "chose Larger (GPU) on Runtime A; other GPUs: Small (GPU) on Runtime A; Large (GPU) on Runtime A; "
-        "--device NAME chooses one"
+        "using Larger (GPU) on Runtime A; other GPUs: Small (GPU) on Runtime A; Large (GPU) on Runtime A; "
+        "select one with --device NAME"
     ]
     caplog.clear()
     set_devices(CPU, LARGE)

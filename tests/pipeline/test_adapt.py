@@ -89,7 +89,7 @@ def test_set_key_is_not_adapted(override, kept, tmp_path):
 
 @pytest.mark.parametrize("override", ["adapt.keep=[model.near]", "adapt.decisions=[{key: seed, value: 3, reason: x}]"])
 def test_key_without_a_decision_is_refused(override):
-    with pytest.raises(ConfigError, match=r"does not decide '(model.near|seed)'; expected one of"):
+    with pytest.raises(ConfigError, match=r"does not set '(model.near|seed)'; expected one of"):
         load("photos", [override])
 
 
@@ -136,7 +136,7 @@ def test_undecided_keys_are_listed_before_preparation():
     [
         ("{type: counted, key: model.sh_degre}", "adapt: counted: "),
         ("{type: counted, key: optimze.steps}", "adapt: counted: optimze.steps: no 'optimze'"),
-        ("{type: counted, key: scene.downscale}", "scene.downscale is used before the photos are measured"),
+        ("{type: counted, key: scene.downscale}", "scene.downscale cannot be adapted, since it is used before"),
         (
             "{type: counted, key: optimize.steps}",
             r"optimize\.steps.* override one of its keys with --set: optimize\.steps, ",

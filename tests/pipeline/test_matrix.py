@@ -54,7 +54,7 @@ def test_cells_with_other_step_counts(write):
 
 def test_steps_need_a_stage_that_trains(write):
     text = "name: s\nmatrix: {seeds: [3], steps: 700}\nstages:\n  - init: {count: 300}\n  - export\n"
-    with pytest.raises(ConfigError, match="expected a stage that trains, such as 'optimize'"):
+    with pytest.raises(ConfigError, match="has no training stage; add one, such as 'optimize'"):
         load_experiment(write(text))
 
 

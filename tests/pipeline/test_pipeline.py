@@ -309,7 +309,7 @@ def test_variants_before_other_keys_leave_those_as_they_are(write, tmp_path):
         ("short:\n  optimize.stepps: 5\n", r"small.yaml:18: short: the file has no key 'optimize.stepps'"),
         ("short:\n  steps: 5\n", r"no key 'steps'"),
         ("short:\n  optimize.during.2.every: 5\n", r"no key 'optimize.during.2.every'"),
-        ("short: [1]\n", r"expected a map 'short', with values of small_7k.yaml"),
+        ("short: [1]\n", r"expected a mapping 'short' with values for small_7k.yaml"),
     ],
 )
 def test_invalid_short_value_is_refused_with_its_location(tmp_path, short, words):
@@ -378,11 +378,11 @@ REFUSED = {
     "cadence outside": (replaced("- evaluate", "- evaluate: {every: 3}"), r"'every' belongs inside optimize.during"),
     "wrong order": (
         replaced("  - init\n", ""),
-        r"stages\[0\] optimize needs 'model', which no earlier stage makes \(made by init\)",
+        r"stages\[0\] optimize needs 'model', which no earlier stage creates; add init before it",
     ),
     "statistics of a model that was replaced": (
         replaced("- evaluate", "- init\n  - densify: {rules: [clone]}"),
-        r"stages\[3\] densify needs 'stats', which stages\[2\] init removes \(made again by optimize\)",
+        r"stages\[3\] densify needs 'stats', which stages\[2\] init removes; add optimize in between",
     ),
     "figures of a model that was replaced": (
         replaced("- export", "- init\n  - report"),

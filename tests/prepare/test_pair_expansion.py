@@ -71,7 +71,7 @@ def test_names_with_spaces_get_no_pairs(matches, tmp_path, caplog):
     assert [a for a, _ in expand_pairs(tmp_path / "database.db", {LAST})] == [
         f"{number}.jpg" for number in range(7) if number != 3
     ]
-    assert "'3 .5.jpg': COLMAP's lists of pairs allow no spaces" in caplog.text
+    assert "'3 .5.jpg': COLMAP's pair lists do not allow spaces" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_failing_expansion_loses_neither_model_nor_features(matches, tmp_path, m
     monkeypatch.setattr(mapping, "DENSER", FeatureOptions(480, 1400))
     figures = map_cameras(matches, tmp_path, attempts=3 if step == "expand_pairs" else 4)
     assert figures["registered"] >= 7
-    assert f"skipping an attempt that failed: {error}" in caplog.text
+    assert f"skipping a failed attempt: {error}" in caplog.text
     assert [text for text in caplog.messages if text.endswith("trying again with denser features")]
 
 

@@ -355,7 +355,7 @@ def test_undistorted_images_do_not_mix_with_others(tmp_path):
     name = f"{sorted((source / 'images').iterdir())[3].stem}.png"
     (tmp_path / "images").mkdir()
     cv2.imwrite(str(tmp_path / "images" / name), np.zeros((4, 4, 3), np.uint8))
-    assert "exists and was not made from this scene" in refusal(undistort_scene, source, tmp_path)
+    assert "exists, and was not created from this scene" in refusal(undistort_scene, source, tmp_path)
     assert [path.name for path in tmp_path.rglob("*")] == ["images", name]
 
 

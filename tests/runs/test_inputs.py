@@ -371,7 +371,7 @@ def test_dry_run_of_a_resume_prints_the_step(scene, tmp_path):
     assert "saved with other settings: seed was 0, is 7" in done.stderr
     for path in (out / "checkpoints").iterdir():
         path.write_bytes(b"")
-    assert "and so are all others" in command(*words, "--resume", expect=7).stderr
+    assert "and so are all other checkpoints" in command(*words, "--resume", expect=7).stderr
 
 
 def test_dry_run_finds_damaged_photographs(scene, tmp_path):

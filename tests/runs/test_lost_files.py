@@ -153,7 +153,7 @@ REFUSALS = {
         {},
         r"has no checkpoint to continue from; `clsplat run \S+ --out \S+ --restart` trains",
     ),
-    "a damaged checkpoint": (OutputError, {}, "and so are all others"),
+    "a damaged checkpoint": (OutputError, {}, "and so are all other checkpoints"),
     "another setting": (ConfigError, {"init.count": 51}, "was saved with other settings"),
     "no such device": (DeviceError, {}, "nowhere"),
 }

@@ -78,7 +78,7 @@ def test_restart_keeps_foreign_files(tiny_scene, tmp_path):
         file.write_bytes(b"")
     (out / "report.html").unlink()
     broken = command("resume", out, expect=7)
-    assert "and so are all others" in broken.stderr
+    assert "and so are all other checkpoints" in broken.stderr
     advice = broken.stderr.split("`")[1].split()
     assert advice[0] == "clsplat"
     command(*advice[1:])

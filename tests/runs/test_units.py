@@ -186,4 +186,4 @@ def test_a_view_in_which_nothing_is_drawn_is_reported(tiny_scene, tmp_path, rng,
         replace(model, means=model.means + np.float32(distance)).save(tmp_path / "a.ply")
         caplog.clear()
         evaluate(tmp_path / "a.ply", tiny_scene)
-        assert ("almost nothing is drawn in 2 of 2 views" in caplog.text) is reported
+        assert ("almost nothing is rendered in 2 of 2 views" in caplog.text) is reported

@@ -266,7 +266,7 @@ def test_dry_resume_prints_the_step(copy):
 
 
 def test_missing_path_error_mentions_run_folders():
-    assert "expected a pipeline, a model, or the folder of a run" in command("check", "runs/nosuch", expect=2).stderr
+    assert "expected a pipeline, a model, or a run folder" in command("check", "runs/nosuch", expect=2).stderr
 
 
 def test_checksums_belong_to_the_last_finished_run(copy):
@@ -298,7 +298,7 @@ def test_check_of_a_matrix_includes_its_cells(tiny_scene, tmp_path):
 def test_folder_without_a_run_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"has neither pipeline.yaml nor status.json"):
         verify(RunState.read(tmp_path))
-    assert "expected the folder of a run" in command("check", tmp_path, expect=3).stderr
+    assert "expected a run folder" in command("check", tmp_path, expect=3).stderr
 
 
 def test_schema_of_a_status_describes_every_key():

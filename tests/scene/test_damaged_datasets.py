@@ -181,7 +181,7 @@ CASES: dict[str, tuple[Callable[[Path], object], int, str]] = {
     "two images of a name": (
         lambda path: scene(path, healthy(images=[ImageEntry("0.png")] * 2)),
         3,
-        "are called '0.png'",
+        "are named '0.png'",
     ),
     "an unknown camera": (changed(camera=7), 3, "has camera 7"),
     "a pose that is not a number": (changed(translation=(float("nan"), 0, 0)), 3, "the pose of '2.png'"),
@@ -206,7 +206,7 @@ CASES: dict[str, tuple[Callable[[Path], object], int, str]] = {
         3,
         "cameras.txt: line 2",
     ),
-    "JSON that is a list": (lambda path: json_text(path, "[1]"), 3, "a list of tables called `frames`"),
+    "JSON that is a list": (lambda path: json_text(path, "[1]"), 3, "a list of objects named `frames`"),
     "JSON that is cut": (lambda path: json_text(path, '{"frames": ['), 3, "not a JSON file"),
     "JSON that is deep": (lambda path: json_text(path, "[" * 100_000), 3, "not a JSON file"),
     "JSON without frames": (transforms(table={"frames": []}), 3, "has no images"),

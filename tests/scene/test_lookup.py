@@ -219,7 +219,7 @@ def test_largest_nested_model_of_equal_photographs_is_used(tmp_path: Path) -> No
 def test_several_scenes_below_are_listed(tmp_path: Path) -> None:
     for name in ("fox", "horse"):
         made(tmp_path / name, "colmap", ["0.jpg", "1.jpg"], ["images/0.jpg", "images/1.jpg"])
-    assert "fox (COLMAP), horse (COLMAP); give one of these" in refusal(read_scene, tmp_path)
+    assert "fox (COLMAP), horse (COLMAP); use one of these" in refusal(read_scene, tmp_path)
 
 
 def test_nested_transforms_file_is_read(tmp_path: Path) -> None:

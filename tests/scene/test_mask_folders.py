@@ -85,7 +85,7 @@ def test_mask_folder_does_not_depend_on_the_working_folder(tiny_scene, tmp_path,
 
 def test_masks_are_refused_for_photos_to_be_undistorted(tmp_path):
     pipeline = load("photos", [f"scene.path='{tmp_path}'", f"scene.masks='{tmp_path}'"])
-    with pytest.raises(ConfigError, match=r"scene\.masks: masks do not fit photos before they are undistorted"):
+    with pytest.raises(ConfigError, match=r"scene\.masks: the masks must fit the undistorted photos"):
         pipeline.preparation(tmp_path / "run")
 
 

@@ -130,7 +130,7 @@ def test_scene_without_times_is_static(tmp_path):
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        ([0, None, 1], "1 of 3 frames have no `time`: .*frames[1]; expected a time in every frame or in none"),
+        ([0, None, 1], "1 of 3 frames have no `time`: .*frames[1]; add the missing times"),
         ([2, 2, 2], "all 3 frames have the time 2; expected at least two times"),
         ([0, float("nan"), 1], "frames[1]: time is nan; expected a number between -1e+15 and 1e+15"),
         ([0, "one", 2], "frames[1]: time is 'one'; expected a number between"),

@@ -87,7 +87,7 @@ def test_damaged_metadata_is_refused(folders, tmp_path):
     label = {**metadata, "test": {**metadata["test"], "label": [0.5] * 8}}
     for content, words in (
         (text[:-20], "not a JSON file"),
-        ("[]", "'train' needs lists of equal length called file_path"),
+        ("[]", "'train' needs lists of equal length named file_path"),
         (json.dumps({"train": metadata["train"]}), "'test' needs lists"),
         (json.dumps(short), "'train' needs lists"),
         (json.dumps(label), r"test\[0\]: label is 0.5"),
@@ -118,7 +118,7 @@ def test_scales_match_the_images(tiny_scene):
     assert [view.camera.width for view in several.downscaled(8).views] == [5] * len(scene.views)
     assert several.downscaled(8).views[0].camera.fx == pytest.approx(scene.views[0].camera.fx / 8)
     assert several.extent == scene.extent
-    with pytest.raises(DataError, match="the largest images have 1/2 of their full size; expected 1/1"):
+    with pytest.raises(DataError, match="the largest images are downscaled by 2, more than by 1; raise"):
         several.downscaled(1)
 
 

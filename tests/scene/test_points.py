@@ -77,7 +77,7 @@ def test_ply_with_other_elements_before_the_vertices(tmp_path: Path, form: str) 
     refusal(read_points_ply, path)
     lists = cameras.replace(b"property uchar", b"property list uchar int")
     path.write_bytes(before + lists + b"element vertex" + vertex + b"end_header\n" + values + body)
-    assert "'camera', with a list, comes before the vertices" in refusal(read_points_ply, path)
+    assert "the element 'camera' has a list and precedes the vertices" in refusal(read_points_ply, path)
 
 
 def test_ply_written_and_read(tmp_path: Path) -> None:

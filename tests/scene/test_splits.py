@@ -89,14 +89,14 @@ def test_split_file_may_be_next_to_unprepared_photos(folder, tmp_path_factory):
 @pytest.mark.parametrize(
     ("choice", "fault"),
     [
-        (ViewSelection(names=["bb.png"]), "no photo is called 'bb.png'; did you mean 'b.png'?"),
-        (ViewSelection(names=["b.gif"]), "no photo is called 'b.gif'"),
+        (ViewSelection(names=["bb.png"]), "no photo is named 'bb.png'; did you mean 'b.png'?"),
+        (ViewSelection(names=["b.gif"]), "no photo is named 'b.gif'"),
         (ViewSelection(file="test.txt"), "test.txt: cannot be read"),
         (
             ViewSelection(names=list(LETTERS)),
-            "scene.holdout takes all 24 photos for testing; name fewer",
+            "scene.holdout selects all 24 photos for testing; name fewer",
         ),
-        (ViewSelection(every=1), "scene.holdout takes all 24 photos"),
+        (ViewSelection(every=1), "scene.holdout selects all 24 photos"),
     ],
 )
 def test_invalid_list_is_refused(folder, choice, fault):
@@ -128,7 +128,7 @@ def test_image_held_out_by_number_is_not_reported_as_left_out(folder):
 
 def test_ambiguous_name_is_refused(tmp_path):
     write(tmp_path, **LENS, frames=frames("a/1.png", "b/1.png", "c.png"))
-    with pytest.raises(DataError, match=r"'1.png' matches 'a/1.png' and 'b/1.png'; give more of the path"):
+    with pytest.raises(DataError, match=r"'1.png' matches 'a/1.png' and 'b/1.png'; use a longer part of the path"):
         read_scene(tmp_path, Split(ViewSelection(names=["1.png"])))
 
 
@@ -173,7 +173,7 @@ def test_explicit_fold_is_used(folder):
 def test_too_large_fold_is_refused(folder):
     with pytest.raises(DataError, match="has 3 training photos; expected at least 4 to hold some out for validation"):
         read_scene(folder, Split(8, ViewSelection(names=["b", "c", "d"]), "auto"))
-    with pytest.raises(DataError, match="takes 24 of 24 training photos"):
+    with pytest.raises(DataError, match="selects 24 of 24 training photos"):
         read_scene(folder, Split(0, None, 1))
 
 
@@ -196,9 +196,9 @@ def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
         assert "skipped 2 names whose photo is missing" in caplog.text
         assert letters(read_scene(folder, Split(0, validation=choice, missing="skip")), "validation") == "ad"
         assert letters(read_scene(folder, Split(0, train=choice, missing="skip")), "train") == "ad"
-    with pytest.raises(DataError, match="no photo is called 'z'"):
+    with pytest.raises(DataError, match="no photo is named 'z'"):
         read_scene(folder, Split(ViewSelection(names=["a", "c", "z"]), missing="skip"))
-    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of .* name photos that are there"):
+    with pytest.raises(DataError, match=r"scene\.holdout selects 0 of .* name photos that are there"):
         read_scene(folder, Split(ViewSelection(names=["c"]), missing="skip"))
     with pytest.raises(DataError, match=r"scene\.train leaves no photo"):
         read_scene(folder, Split(0, train=ViewSelection(names=["c"]), missing="skip"))
@@ -207,7 +207,7 @@ def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
 def test_missing_photographs_are_refused_with_the_skip_setting(folder, caplog):
     for letter in "bc":
         (folder / "images" / f"{letter}.png").unlink()
-    with pytest.raises(DataError, match=r"2 of 24 .* missing: .*put them back, or --set scene\.missing=skip"):
+    with pytest.raises(DataError, match=r"2 of 24 .* missing: .*restore them, or --set scene\.missing=skip"):
         read_scene(folder)
     caplog.set_level(logging.WARNING, "clsplat")
     scene = read_scene(folder, Split(8, missing="skip"))
@@ -220,7 +220,7 @@ def test_missing_photographs_are_refused_with_the_skip_setting(folder, caplog):
 def test_dataset_without_images_is_refused(folder):
     for file in (folder / "images").iterdir():
         file.unlink()
-    with pytest.raises(DataError, match=r"24 of 24 image files are missing: .*put them back$"):
+    with pytest.raises(DataError, match=r"24 of 24 image files are missing: .*restore them$"):
         read_scene(folder, Split(missing="skip"))
 
 
@@ -230,10 +230,10 @@ def test_dataset_without_images_is_refused(folder):
         ("holdout=-1", "expected a number, {every, offset}, {names: […]} or {file: …}, got -1"),
         ("holdout={every: 8, offset: 8}", "'offset' must be less than 'every', 8"),
         ("holdout={every:8,offset:4}", "or {file: …} (YAML needs a space after each colon)"),
-        ("holdout={every: 8, offset: -1}", "expected an offset of 0 or more, not -1"),
+        ("holdout={every: 8, offset: -1}", "expected an offset of 0 or more, got -1"),
         ("holdout={offset: 4}", "'offset' needs 'every', as in {every: 8, offset: 4}"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
-        ("holdout={names: [42]}", "expected names of photos as text: put numbers in quotes, as in '0042'"),
+        ("holdout={names: [42]}", "expected names of photos as strings: put numbers in quotes, as in '0042'"),
         ("holdout={names: [a, '']}", "expected names of photos, none of them empty"),
         ("train={names: [1.5]}", "put numbers in quotes, as in '0042', got 1.5"),
         ("validation=best", "or auto, got 'best'"),
@@ -258,7 +258,7 @@ def test_fewer_than_three_photographs_give_a_warning_first(tiny_scene, caplog, c
 
 
 def test_every_nth_without_test_views_is_refused(folder):
-    with pytest.raises(DataError, match=r"scene\.holdout takes 0 of 24 photos .* lower its offset, or set"):
+    with pytest.raises(DataError, match=r"scene\.holdout selects 0 of 24 photos .* lower its offset, or set"):
         read_scene(folder, Split(ViewSelection(every=100, offset=99)))
 
 

@@ -167,8 +167,8 @@ def test_interruption_between_edits_changes_no_bits(finished, tiny_scene, pipeli
 @pytest.mark.parametrize(
     ("fields", "complaint"),
     [
-        ("{}", "give either 'keep' or 'remove'"),
-        ("{keep: 0.5, remove: 0.5}", "give either 'keep' or 'remove'"),
+        ("{}", "set either 'keep' or 'remove'"),
+        ("{keep: 0.5, remove: 0.5}", "set either 'keep' or 'remove'"),
         ("{keep: 0.0}", "greater than 0"),
         ("{remove: 1.0}", "less than 1"),
         ("{remove: 0.5, score: weights}", "expected 'weight' or 'sensitivity'"),

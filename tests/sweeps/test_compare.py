@@ -408,7 +408,7 @@ def test_refusals(make_run, tmp_path, how, code, words):
 
 def test_same_run_twice_is_refused(make_run, tmp_path):
     folder = make_run("run")
-    with pytest.raises(ConfigError, match="given twice"):
+    with pytest.raises(ConfigError, match="listed twice"):
         write_comparison([folder, tmp_path / "." / "run"], tmp_path / "page.html")
 
 

@@ -42,7 +42,9 @@ def test_key_includes_the_content_of_a_folders_model(few_steps, tiny_scene, tmp_
     (first / "point_cloud.ply").write_bytes(b"another")
     assert from_model(first, tiny_scene, tmp_path / "notes") != key
     (first / "point_cloud.ply").unlink()
-    with pytest.raises(DataError, match="one: no model here; expected a file, or the folder of a finished run"):
+    with pytest.raises(
+        DataError, match="one: contains no model; expected a model file or the folder of a finished run"
+    ):
         from_model(first, tiny_scene, tmp_path / "notes")
 
 

@@ -150,7 +150,7 @@ def test_sweep_resumes_after_its_scheduler_is_killed(tiny_scene, tmp_path, expec
         first.kill()
         errors = processes[1].communicate(timeout=200)[1]
         assert processes[1].returncode == 4, errors
-        assert "the scheduler ended; start it, and run the sweep again with --resume" in errors
+        assert "the scheduler exited; restart it, and run the sweep again with --resume" in errors
     until(lambda: not remaining_runs(tmp_path), 90)
     with scheduler(port, processes):
         processes += [offer(port), sweep.start()]

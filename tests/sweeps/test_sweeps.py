@@ -180,7 +180,7 @@ def test_sweep_resumes_only_in_its_first_store(file, execution_file, runs, tmp_p
     runs["seed: 1"] = 6
     with pytest.raises(ClsplatError, match="1 of 2 cells failed"):
         commands.run(file, out=out, on=execution_file)
-    with pytest.raises(ConfigError, match=r"out: was started with --on; its cells are in .*store; give --on again"):
+    with pytest.raises(ConfigError, match=r"out: was started with --on; its cells are in .*store; pass --on again"):
         commands.resume(out)
 
 
@@ -203,7 +203,7 @@ def test_cells_run_unchanged_without_a_store(file, tmp_path, monkeypatch):
     assert ran == [(None, None, None)]
 
 
-ONLY_ON = "a pipeline file may not set this; give it in a file with --on"
+ONLY_ON = "a pipeline file may not set this; set it in a file for --on"
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ ONLY_ON = "a pipeline file may not set this; give it in a file with --on"
         ("store: ../elsewhere", f"execution.store: {ONLY_ON}"),
         ("insecure: true", f"execution.insecure: {ONLY_ON}"),
         ("tls: {ca: a, cert: b, key: c}", f"execution.tls: {ONLY_ON}"),
-        ("engine: 'dask://127.0.0.1:1'", "execution.engine: expected inline or local; .* with --on, got 'dask://127"),
+        ("engine: 'dask://127.0.0.1:1'", "execution.engine: expected inline or local; .* for --on, got 'dask://127"),
     ],
 )
 def test_invalid_execution_is_refused_with_its_line(tmp_path, text, words):
@@ -384,7 +384,7 @@ def test_stopped_scheduler_is_reported_with_a_remedy(tmp_path):
     cluster = scheduler.Cluster(client, Store(tmp_path))
     client.info, client.status = {}, "closed"
     for call in (cluster.slots, lambda: cluster.start(CellRun("a", SPEC, ""), SLOT, CellOptions(0.0))):
-        with pytest.raises(DeviceError, match=r"the scheduler ended; .* with --resume"):
+        with pytest.raises(DeviceError, match=r"the scheduler exited; .* with --resume"):
             call()
 
 

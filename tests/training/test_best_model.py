@@ -284,7 +284,7 @@ def test_refit_resumed_from_any_checkpoint_gives_the_same(tiny_scene, tmp_path, 
 
 def test_refit_does_not_resume_with_other_steps(tiny_scene, tmp_path, pipeline, refit):
     out = shutil.copytree(refit, tmp_path / "run")
-    with pytest.raises(ConfigError, match="is of a refit, whose steps were chosen by validation"):
+    with pytest.raises(ConfigError, match="is from a refit, whose steps were chosen by validation"):
         train(tiny_scene, out, *REFIT, "optimize.steps=80", pipeline=pipeline, resume=True)
 
 

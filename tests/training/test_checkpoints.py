@@ -105,7 +105,7 @@ def test_checkpoint_before_an_unreadable_one_is_used(killed_run, tiny_scene, few
 
     monkeypatch.setattr(zipfile.ZipFile, "read", fail)
     train(tiny_scene, killed_run, *FEW, resume=True)
-    assert "step_000009.npz is damaged (the disk cannot read it: bad disk); using an earlier one" in caplog.text
+    assert "step_000009.npz is damaged (it cannot be read from disk: bad disk); using an earlier one" in caplog.text
     assert digest(killed_run) == digest(few_steps)
 
 

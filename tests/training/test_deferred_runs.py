@@ -123,7 +123,9 @@ def test_harmonics_move_to_the_host_if_the_device_is_full(spread, at_once, tiny_
     out, own, device = tmp_path / "run", [f"scene.path='{tiny_scene}'", *spread], small(3150)
     with caplog.at_level("INFO", "clsplat"):
         run_pipeline(load("smoke", own), RunState.read(out), Device(device), "new")
-    (told,) = [record.message for record in caplog.records if "harmonics move to the host, since" in record.message]
+    (told,) = [
+        record.message for record in caplog.records if "moving SH coefficients to the host, since" in record.message
+    ]
     assert not told.startswith("step 0: ")
     assert digest(out) == digest(at_once)
     for memory in (device.memory, 8 << 30):
@@ -160,7 +162,7 @@ def test_too_large_model_starts_with_harmonics_on_the_host(spread, tiny_scene, t
         with caplog.at_level("INFO", "clsplat"):
             own = [f"scene.path='{tiny_scene}'", *spread, "densify.start=99", *more]
             run_pipeline(load("smoke", own), RunState.read(tmp_path / name), Device(small(1900)), "new")
-    messages = [one.message for one in caplog.records if "harmonics move to the host" in one.message]
+    messages = [one.message for one in caplog.records if "moving SH coefficients to the host" in one.message]
     assert [one.startswith("step 0: ") for one in messages] == [True, True]
     assert ["the device can hold only 1," in one for one in messages] == [True, False]
     assert digest(tmp_path / "auto") == digest(tmp_path / "host")

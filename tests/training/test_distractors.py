@@ -173,11 +173,11 @@ def test_foreign_distractor_tables_are_refused(device, rng):
     tables = Pair(device, rng).own.tables()
     Distractors.check_saved({}, tables)
     damaged = [
-        ({"means": tables["means"][:-1]}, "the same number of rows for each photo"),
-        ({"updates": tables["updates"][:0]}, "the same number of rows for each photo"),
-        ({"sh_base": tables["sh_base"][:, :2]}, "the same number of rows for each photo"),
+        ({"means": tables["means"][:-1]}, "the same number of rows for every photo"),
+        ({"updates": tables["updates"][:0]}, "the same number of rows for every photo"),
+        ({"sh_base": tables["sh_base"][:, :2]}, "the same number of rows for every photo"),
         ({"quats": np.full_like(tables["quats"], np.nan)}, "quats of its Distractors has values that are not finite"),
-        ({"sh_rest": tables["means"]}, "the same number of rows for each photo"),
+        ({"sh_rest": tables["means"]}, "the same number of rows for every photo"),
     ]
     for change, message in damaged:
         with pytest.raises(DataError, match=message):

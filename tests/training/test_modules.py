@@ -54,11 +54,11 @@ def test_modules_are_set_by_their_type():
 @pytest.mark.parametrize(
     ("settings", "fault"),
     [
-        (["optimize.modules.expsure={}"], "no 'expsure'; expected one of .*; did you mean exposure"),
-        (["optimize.modules.exposure=gain"], "expected a mapping of its keys"),
+        (["optimize.modules.expsure={}"], "unknown type 'expsure'; expected one of .*; did you mean exposure"),
+        (["optimize.modules.exposure=gain"], "expected a mapping of keys to values"),
         (["optimize.modules=[{type: transients, start: 1}, exposure]"], "'exposure' is listed after 'transients'"),
-        (["optimize.modules=[exposure, exposure]"], "'exposure' and 'exposure' exclude each other"),
-        (["optimize.modules=[exposure, bilateral_grid]"], "'bilateral_grid' and 'exposure' exclude each other"),
+        (["optimize.modules=[exposure, exposure]"], "'exposure' and 'exposure' cannot be combined"),
+        (["optimize.modules=[exposure, bilateral_grid]"], "'bilateral_grid' and 'exposure' cannot be combined"),
         (["optimize.modules.camera_optimizer={}", "model.background=envmap"], "cannot be combined with sky"),
     ],
 )

@@ -121,7 +121,7 @@ def test_checkpoint_of_another_format_is_refused(tiny_scene, tmp_path, monkeypat
     train(tiny_scene, tmp_path, *FEW, "optimize.steps=4")
     monkeypatch.undo()
     before = (tmp_path / "metrics.jsonl").read_bytes()
-    with pytest.raises(ConfigError, match=r"has format 1, expected 5.*give another --out"):
+    with pytest.raises(ConfigError, match=r"has format 1, expected 5.*use another --out"):
         train(tiny_scene, tmp_path, *FEW, "optimize.steps=4", resume=True)
     assert (tmp_path / "metrics.jsonl").read_bytes() == before
 

@@ -99,7 +99,7 @@ def test_scripts_are_short_and_part_of_the_page():
 def test_too_large_page_for_browsers_is_refused(page, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MAX_SIZE", 0.95 * page.size)
     with pytest.raises(
-        OutputError, match=r"page would have 0 MB, .*show only the \d+ most important splats \(--splats \d+\)"
+        OutputError, match=r"page would be 0 MB, .*show only the \d+ most important splats \(--splats \d+\)"
     ):
         page.write(tmp_path / "page.html")
     assert not list(tmp_path.iterdir())

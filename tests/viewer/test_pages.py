@@ -189,6 +189,8 @@ def test_report_escapes_markup_in_names(tiny_scene, tmp_path):
 @pytest.mark.parametrize("text", ["", "<html>", "<html></html", "<html></html><p>"])
 def test_truncated_page_is_refused(text, tmp_path):
     (tmp_path / "a.html").write_text(text)
-    assert refusal(require_complete, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: is truncated; make the page again"
+    assert (
+        refusal(require_complete, tmp_path / "a.html") == f"{tmp_path / 'a.html'}: is truncated; create the page again"
+    )
     (tmp_path / "a.html").write_text("<html></html>\n")
     require_complete(tmp_path / "a.html")

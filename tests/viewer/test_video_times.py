@@ -61,9 +61,9 @@ def test_fixed_camera_is_one_view_over_time(scene):
     assert [view.time for view in views] == [0, 0.25, 0.5, 0.75, 1]
     named = plan_views(scene, "fixed:c3/1")
     assert (named[0].world_to_camera == scene.views[7].world_to_camera).all()
-    with pytest.raises(DataError, match="no photo is called 'c9/0'"):
+    with pytest.raises(DataError, match="no photo is named 'c9/0'"):
         plan_views(scene, "fixed:c9/0")
-    with pytest.raises(ConfigError, match="only `fixed:NAME` names a view"):
+    with pytest.raises(ConfigError, match="only `fixed:NAME` accepts the name of a view"):
         plan_views(scene, "orbit:c3/1")
 
 

@@ -68,7 +68,7 @@ def test_path_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_pa
     )
     assert result["frames"] == 2
     assert f"the folder of its photos, {tmp_path / 'gone'}, is missing" in caplog.text
-    with pytest.raises(DataError, match="is missing; give the folder of the scene"):
+    with pytest.raises(DataError, match="is missing; pass the folder of the scene"):
         clsplat.render_path(tmp_path / "run", video=None, out=tmp_path / "b")
 
 

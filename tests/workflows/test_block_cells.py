@@ -45,7 +45,7 @@ def test_empty_model_is_not_cut():
 
 
 def test_coincident_positions_are_not_cut():
-    with pytest.raises(DataError, match="5 Gaussians cannot be split into 2 blocks; give fewer --blocks"):
+    with pytest.raises(DataError, match="5 Gaussians cannot be split into 2 blocks; use fewer --blocks"):
         cells(np.ones((5, 3)), np.ones(5), 2)
 
 

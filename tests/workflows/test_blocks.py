@@ -284,7 +284,7 @@ def test_coarse_model_is_trained_if_none_is_given(tiny_scene, tmp_path):
             "densify.budget cannot be used with blocks: it limits the whole",
         ),
         ("densify.per_pixel=0.1", "densify.per_pixel cannot be used with blocks: blocks have different photos"),
-        ("init.source=random", "start with `init: {source: model}`, and add a stage 'optimize'"),
+        ("init.source=random", "expected `init: {source: model}` first, and an 'optimize' stage"),
     ],
 )
 def test_settings_that_blocks_cannot_share_are_refused(override, message, tiny_scene, few_steps, tmp_path):

@@ -192,7 +192,7 @@ def test_interrupted_search_resumes_when_repeated(few_steps, tmp_path, monkeypat
 
 
 def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
-    with pytest.raises(ConfigError, match="a search that differs in steps; remove it or give another --out"):
+    with pytest.raises(ConfigError, match="a search that differs in steps; remove it or use another --out"):
         clsplat.compress_model(few_steps, target="1MB", out=searched, keep=KEEP, steps=STEPS + 1)
     (tmp_path / "own.txt").write_text("mine")
     with pytest.raises(ConfigError, match="contains files that are not part of a search"):
@@ -238,7 +238,7 @@ def test_search_killed_early_resumes_and_removes_leftovers(few_steps, tmp_path):
 @pytest.mark.parametrize("text", ["", "[]"])
 def test_damaged_search_record_is_reported_with_a_remedy(text, few_steps, tmp_path):
     (tmp_path / "compress.json").write_text(text)
-    with pytest.raises(ConfigError, match=r"compress\.json: is not the record of a search; remove .* or give another"):
+    with pytest.raises(ConfigError, match=r"compress\.json: is not the record of a search; remove .*, or use another"):
         clsplat.compress_model(few_steps, target="1MB", out=tmp_path, keep=[1.0])
 
 

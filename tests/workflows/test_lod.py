@@ -119,7 +119,7 @@ def test_merging_without_training_is_reported(model_file, tmp_path):
 
 @pytest.mark.parametrize("option", ["steps", "downscale", "device"])
 def test_options_that_need_photographs_are_refused_without_them(option, model_file, tmp_path):
-    message = rf"model\.ply: has no known photos, which --{option} needs; give --scene, or leave --{option} out$"
+    message = rf"model\.ply: has no known photos, which --{option} needs; pass --scene, or omit --{option}$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(model_file, tmp_path / "site", **{option: STEPS})
     assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
@@ -141,11 +141,11 @@ def test_zero_steps_need_no_photographs(there, moved, tmp_path, caplog):
         (tmp_path / "gone").mkdir()
     result = clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0)
     assert (len(result["levels"]), result["split"]) == (2, None)
-    assert "levels are merged without training, and are not measured" in caplog.text
+    assert "levels are merged without training, and are not evaluated" in caplog.text
 
 
 def test_device_is_refused_if_the_photographs_have_moved(moved, tmp_path):
-    message = r"run: its photos cannot be read, which --device needs; give --scene, or leave --device out$"
+    message = r"run: its photos cannot be read, which --device needs; pass --scene, or omit --device$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0, device="nosuch")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -153,7 +153,7 @@ def test_device_is_refused_if_the_photographs_have_moved(moved, tmp_path):
 
 def test_missing_photographs_are_refused_with_a_remedy(moved, tmp_path):
     with pytest.raises(
-        DataError, match=r"gone, is missing; .* \(give --scene DIR, or --steps 0 to merge without photos\)$"
+        DataError, match=r"gone, is missing; .* \(pass --scene DIR, or --steps 0 to merge without photos\)$"
     ):
         clsplat.write_levels(moved, tmp_path / "site")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -260,7 +260,7 @@ def test_empty_model_and_a_folder_in_use_are_refused(few_steps, tmp_path):
     model[:0].save(tmp_path / "empty.ply")
     with pytest.raises(DataError, match=r"empty\.ply: the model has no Gaussians to merge"):
         clsplat.write_levels(tmp_path / "empty.ply", tmp_path / "site")
-    with pytest.raises(ConfigError, match="already exists; give a new folder"):
+    with pytest.raises(ConfigError, match="already exists; use a new folder"):
         clsplat.write_levels(few_steps, tmp_path)
 
 

@@ -135,7 +135,7 @@ def measure(
     if unknown_names := [name for name in scenes if name not in SIZES]:
         raise ConfigError(f"--scenes: expected names from {', '.join(SIZES)}, got '{unknown_names[0]}'")
     if (model is None) != (scene is None):
-        raise ConfigError("bench: --model and --scene go together")
+        raise ConfigError("bench: --model and --scene are used together; add the other one")
     settings = load(pipeline).settings
     bench_device = open_device(device, schedule)
     peaks = measure_peaks(bench_device)

@@ -161,7 +161,7 @@ class Live:
         with run.status.stage("paused"):
             while state.paused and not run.interrupted:
                 if state.idle_seconds() > PAUSE_TIMEOUT:
-                    LOG.info("no live page for %.0f s; resuming", PAUSE_TIMEOUT)
+                    LOG.info("no live page connected for %.0f s; resuming training", PAUSE_TIMEOUT)
                     state.pause(False)
                 elif state.requests:
                     self._draw(run, preview, is_paused=True)

@@ -147,7 +147,7 @@ class Preview:
         device, training = self.run.device, self.run.rasterizer
         if device.allocated + training.workspace.nbytes > MAX_MEMORY * device.info.memory:
             self.release()
-            raise MemoryLimitError("the training leaves no device memory for previews")
+            raise MemoryLimitError("training leaves no device memory for previews")
         if self._rasterizer is None:
             limits = Limits(min(MAX_PAIRS, training.budget.pairs), training.budget.tiles)
             sort = training.tiler.sort

@@ -87,7 +87,7 @@ def parse_request(target: str, host: str, token: str) -> Request:
         parts = urlsplit(target)
         query = parse_qsl(parts.query, keep_blank_values=True, max_num_fields=MAX_FIELDS)
     except ValueError:
-        raise RequestError(400, "expected the address of this page") from None
+        raise RequestError(400, "invalid URL; expected that of this page") from None
     secret, _, path = unquote(parts.path)[1:].partition("/")
     if not hmac.compare_digest(secret.encode("utf-8", "replace"), token.encode()):
         raise RequestError(404, "not found")
@@ -280,7 +280,7 @@ class Handlers:
                 view = replace(view, time=parse_timestamp(request.query["time"]))
         preview = PreviewRequest(request.number("page", 0, 1 << 40), view, cast(Pace, pace))
         if not live.requests.wait_for(preview, WAIT):
-            raise RequestError(503, "too many previews are requested")
+            raise RequestError(503, "too many preview requests")
         if preview.picture is None:
             return Response(204)
         return Response(200, preview.picture.jpeg, "image/jpeg", {"X-Step": str(preview.picture.step)})
@@ -295,7 +295,7 @@ class Handlers:
         except DataError as error:
             raise RequestError(404, str(error)) from None
         if data is None:
-            raise RequestError(503, "busy; request it again")
+            raise RequestError(503, "busy; try again")
         return Response(200, data, "image/jpeg", {"Cache-Control": "private, max-age=3600"})
 
     def _pause(self, is_paused: bool) -> Response:
@@ -333,7 +333,7 @@ def parse_camera(text: str) -> View:
     if (len(eye), len(rotation), len(lens)) != (3, 4, 6) or not all(
         abs(v) <= MAX_NUMBER for v in [*eye, *rotation, *lens]
     ):
-        raise RequestError(400, "camera: expected 3, 4, and 6 finite numbers")
+        raise RequestError(400, "camera: expected eye (3), quaternion (4), and lens (6) of finite numbers")
     fx, fy, cx, cy, width, height = lens
     sides = sorted((width, height))
     if not (math.hypot(*rotation) > 1e-6 and min(fx, fy) > 1e-3 and sides[0] >= 1 and sides[1] <= MAX_SIDE):

@@ -130,12 +130,12 @@ class RunComparison:
         is given twice, or a pipeline.yaml cannot be read.
         """
         if not paths:
-            raise ConfigError("no runs to compare; give the folder of at least one run")
+            raise ConfigError("no runs to compare; pass at least one run folder")
         runs = [RunFolder.read(folder) for path in paths for folder in _cells(path)]
         resolved_paths: set[Path] = set()
         for run in runs:
             if run.path.resolve() in resolved_paths:
-                raise ConfigError(f"{run.path}: the run is given twice; give each run once")
+                raise ConfigError(f"{run.path}: is listed twice; list each run once")
             resolved_paths.add(run.path.resolve())
         return cls(runs)
 

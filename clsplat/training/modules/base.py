@@ -219,7 +219,7 @@ def check_list(modules: Sequence[TrainingModule]) -> None:
     types: dict[str, str] = {}
     for module in modules:
         if module.group in types:
-            raise ValueError(f"'{module.type}' and '{types[module.group]}' exclude each other; remove one of them")
+            raise ValueError(f"'{module.type}' and '{types[module.group]}' cannot be combined; remove one of them")
         types[module.group] = module.type
 
 

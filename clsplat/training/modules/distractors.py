@@ -73,7 +73,7 @@ class Distractors(TrainingModule):
         photographs, rows = len(tables.get(UPDATES, ())), len(tables.get("means", ()))
         shapes = {name: (photographs if name == UPDATES else rows, width) for name, width in widths.items()}
         if not photographs or not rows or rows % photographs or {n: t.shape for n, t in tables.items()} != shapes:
-            raise DataError("its distractor tables do not have the same number of rows for each photo")
+            raise DataError("its distractor tables must have the same number of rows for every photo")
 
 
 class DistractorsState(ModuleState):

@@ -144,7 +144,7 @@ class Appearance(TrainingModule):
         if not isinstance(name, str) or name not in classes:
             names = ", ".join(classes)
             raise DataError(
-                f"{path}: unknown type of colors {quote(name)}, expected {names}; train again, or remove the file"
+                f"{path}: unknown color type {quote(name)}; expected {names}; train again, or remove the file"
             )
         fields = {key: data[key] for key in ("model",) if key in data}
         return classes[name].model_validate(fields).fit if classes[name] is cls else None

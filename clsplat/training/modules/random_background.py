@@ -31,7 +31,7 @@ class RandomBackground(TrainingModule):
 
     def create_state(self, run: Run) -> ModuleState:
         if self.when == "transparent":
-            LOG.info("random background in training, since photos have transparent pixels")
+            LOG.info("training with a random background, since photos have transparent pixels")
         run.photographs.keep_transparency()
         return RandomBackgroundState(run.device, run.seed)
 

@@ -59,7 +59,7 @@ def start_sky(run: Run, source: Model | None) -> None:
     texels, free = _first_texels(run, background.side)
     sky = initial if initial and initial.side == background.side else Sky(texels)
     run.modules[SKY] = LearnedSky(background, sky.upload(run.device), free)
-    LOG.info("sky: %d of %d x %d texels are learned", free.sum(), background.side, background.side)
+    LOG.info("sky: optimizing %d of its %d x %d texels", free.sum(), background.side, background.side)
 
 
 def sky_reason(run: Run) -> str:

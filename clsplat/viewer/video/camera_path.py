@@ -65,7 +65,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         return _read_cameras(path)
     frames = data.get("camera_path") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise DataError(f"{path}: expected a table with a list `camera_path`, as nerfstudio exports it")
+        raise DataError(f"{path}: expected a JSON object with a list `camera_path`, as nerfstudio exports it")
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
     if (kind := data.get("camera_type", "perspective")) != "perspective":
@@ -197,7 +197,7 @@ def _rigid(frame: JsonFrame, key: str) -> Floats:
     except (ValueError, TypeError, OverflowError, IndexError):
         matrix = np.empty(0)
     if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3]) - 1) > 1e-3:
-        raise DataError(f"{frame.source}: {key} is not 3x4 numbers with a rotation; export the file again")
+        raise DataError(f"{frame.source}: {key} is not a 3x4 matrix with a rotation; export the file again")
     return matrix
 
 

@@ -105,7 +105,7 @@ class VideoRequest:
                 f"path {quote(path)}: expected one of {', '.join(PATHS)}, or a file of nerfstudio (.json)"
             )
         if SEPARATOR in path and path.partition(SEPARATOR)[0] in PATHS and not path.startswith(f"fixed{SEPARATOR}"):
-            raise ConfigError(f"path {quote(path)}: only `fixed{SEPARATOR}NAME` names a view")
+            raise ConfigError(f"path {quote(path)}: only `fixed{SEPARATOR}NAME` accepts the name of a view")
         return cls(
             path,
             None if frames is None else check_frames(frames),
@@ -161,7 +161,7 @@ def _plan_path(request: VideoRequest, scene: Scene | None, points: Floats, origi
         return VideoPlan(camera_path.resample(views, request.frames or len(views)), request.fps or camera_file.fps)
     if scene is None:
         raise ConfigError(
-            f"the path {request.path} needs the cameras of a scene; give --scene, a run folder, or a file"
+            f"the path {request.path} needs the cameras of a scene; pass --scene, a run folder, or a path file"
         )
     rig = Rig.from_views(scene.views, points)
     size = request.size or even_size(rig.camera)
