@@ -1,4 +1,4 @@
-"""Train with a loss written in NumPy, next to those of a pipeline: `python own_loss.py SCENE [PIPELINE]`."""
+"""Add a loss written in NumPy to the losses of a pipeline: `python own_loss.py SCENE [PIPELINE]`."""
 
 import sys
 
@@ -8,7 +8,7 @@ import clsplat
 
 
 def edges(image, photograph):
-    """Return the mean absolute difference of the image slopes, and its derivative with respect to the first image.
+    """Return the mean absolute difference of the image gradients, and its derivative with respect to `image`.
 
     image, photograph: [height, width, 3] float32.
     """

@@ -11,15 +11,15 @@ class PruneAtRandom(Rule):
     """Remove a random fraction of the faint Gaussians."""
 
     type: Literal["prune_at_random"] = "prune_at_random"
-    share: Positive = 0.5
+    fraction: Positive = 0.5
     """Fraction of the faint Gaussians to remove; may be scheduled."""
     opacity_below: Positive = 0.1
     """Opacity below which a Gaussian is faint; may be scheduled."""
 
     def mark(self, edit: Edit) -> None:
         opacity = 1 / (1 + np.exp(-edit.gaussians.get("logit_opacity")[:, 0]))
-        faint = opacity < edit.at(self.opacity_below)
-        edit.choose(faint & (edit.random().random(len(faint)) < edit.at(self.share)), copies=0, old_rows=0)
+        is_faint = opacity < edit.at(self.opacity_below)
+        edit.choose(is_faint & (edit.random().random(len(is_faint)) < edit.at(self.fraction)), copies=0, old_rows=0)
 
 
 class CapSize(Scheduled):

@@ -28,9 +28,9 @@ def test_the_kernel_adds_the_gradient_and_returns_the_value(schedule, count):
     gradients = GaussianGradients(gaussians)
     gradients["logit_opacity"].fill(0.25)  # the gradient of other losses
     inputs = PenaltyInputs(Workspace(gaussians.device), gaussians, gradients, extent=1.0, step=1)
-    found = variants(Penalty)["opacity_entropy"](weight=3.0).add(inputs)
+    loss = variants(Penalty)["opacity_entropy"](weight=3.0).add(inputs)
     value, derivative = mean_entropy(logits.astype(np.float64))
-    assert found.value() == pytest.approx(3 * value, rel=1e-5)
+    assert loss.value() == pytest.approx(3 * value, rel=1e-5)
     planes = gradients["logit_opacity"].get()
     np.testing.assert_allclose(planes[0, :count] - 0.25, 3 * derivative[:, 0], rtol=1e-4, atol=1e-6)
     assert (planes[0, count:] == 0.25).all()  # padding rows stay unchanged

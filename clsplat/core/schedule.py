@@ -45,7 +45,7 @@ PointList = Annotated[list[Point], AfterValidator(_require_increasing_steps)]
 
 
 class Curve(Settings):
-    """A schedule given as a mapping; a `Schedule` field accepts any subclass, plug-ins included."""
+    """A schedule given as a mapping.  A `Schedule` field accepts any subclass, including those of plug-ins."""
 
     @abstractmethod
     def at(self, step: int) -> float:

@@ -46,7 +46,7 @@ class Mixtures:
 
     @classmethod
     def from_pairs(cls, tables: dict[str, Floats], mass: Floats, first: Rows, second: Rows) -> "Mixtures":
-        """Compute the mixtures of rows `first` and `second`, [pairs] each.  mass: of all rows, [N], from `masses`."""
+        """Compute the mixtures of rows `first` and `second`, [pairs] each.  mass: of all rows, [N]; see `masses`."""
         total = mass[first] + mass[second]
         fraction = (mass[second] / total)[:, None]
         means = (1 - fraction) * tables["means"][first] + fraction * tables["means"][second]

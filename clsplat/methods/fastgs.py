@@ -48,7 +48,7 @@ class ByWrongPixels(Rule):
     """Error above which a pixel is wrong: mean over channels, scaled to [0, 1] in each view."""
 
     def count_wrong_pixels(self, edit: Edit) -> WrongPixels:
-        """Return the counts for the Gaussians before the edit."""
+        """Return the counts of wrong pixels for the Gaussians before the edit."""
         return edit.survey.compute_once(count_wrong_pixels, self.views, self.error_above)
 
 

@@ -48,7 +48,7 @@ class Splitting(Statistic):
 
 
 class SplitSteepest(Rule):
-    """Replace a Gaussian by two, moved apart in the direction that lowers the loss most.
+    """Replace a Gaussian with two, moved apart in the direction that lowers the loss most.
 
     A Gaussian is split if the smallest eigenvalue of its splitting matrix, averaged over views, is low enough; the
     children move along the eigenvector.  If the edit has a limit (`max_gaussians`, `budget`, memory), the lowest

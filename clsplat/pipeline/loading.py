@@ -226,7 +226,7 @@ def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> Pip
 
 
 def without_decisions(data: dict[str, Any]) -> dict[str, Any]:
-    """Return a file's data without the decisions of a run, so that the next run decides again."""
+    """Return a file's data without the decisions of an earlier run, so that they are made again."""
     adapt = data.get("adapt")
     return {**dict(without_auto(data)), "adapt": {**adapt, "decisions": None} if isinstance(adapt, dict) else adapt}
 

@@ -127,7 +127,7 @@ def fingerprint(folder: Path, excluded_folder: Path) -> str:
 
 
 def make_note(steps: Sequence[PlannedStep]) -> dict[str, str]:
-    """Return the note that a run folder keeps: the hash of the prepared photographs, and their folder."""
+    """Return the note for a run folder: the hash of the prepared photographs, and their folder."""
     return {"inputs": steps[-1].key, "folder": str(steps[-1].folder)}
 
 

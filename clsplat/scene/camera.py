@@ -315,7 +315,7 @@ class Lens:
         return fx * x + cx, fy * y + cy
 
     def project(self, points: Floats) -> Floats:
-        """Project points in camera space, [M, 3], to pixels, [M, 2].  Only wide lenses show points behind them."""
+        """Project points in camera space, [M, 3], to pixels, [M, 2].  Points behind the camera need a wide lens."""
         x, y, z = points.T
         return np.stack(self.distort(x, y, z) if self.is_wide else self.distort(x / z, y / z), axis=1)
 

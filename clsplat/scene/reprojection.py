@@ -70,7 +70,7 @@ def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats 
 
 
 def filter_tracks(tracks: Tracks, views: Iterable[View], limit: float = MAX_ERROR) -> Tracks:
-    """Return the tracks without observations that have a reprojection error of `limit` px or more.
+    """Return a copy of the tracks that omits observations with a reprojection error of `limit` px or more.
 
     Errors are measured at the size of the view.  Views without known observations, and views that are not in `views`,
     keep all points.

@@ -302,7 +302,7 @@ def _add_to_mean(gaussians: Gaussians, values: Mapping[str, Array], prefix: str,
 
 
 def take_average(gaussians: Gaussians) -> None:
-    """Replace the parameters by their averages in rows that have one, and remove the tables of averages."""
+    """Replace parameters with their averages in all rows that have one, and remove the tables of averages."""
     program = gaussians.device.program("average.cl")
     for name in gaussians.trained:
         program.take_average(

@@ -43,7 +43,7 @@ class MotionRates(Settings):
     """Lower bound of durations; a Gaussian that is much shorter than a frame is invisible between two frames."""
 
     def times(self, factor: float) -> "MotionRates":
-        """Return all rates multiplied by a factor."""
+        """Return the rates, each multiplied by a factor."""
         return self.model_copy(update={name: divide(getattr(self, name), 1 / factor) for name in self._rates})
 
     @property

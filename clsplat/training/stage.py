@@ -98,7 +98,7 @@ ALL_HARMONICS = {
 
 
 class Scheduled(Stage):
-    """A stage that may be listed in `optimize.during`, where it runs at a cadence.
+    """A stage that can be listed in `optimize.during` and runs at a cadence.
 
     It runs at every multiple of `every`, rounded down, after step `start` and before step `stop`.
     """

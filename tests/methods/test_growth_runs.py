@@ -58,7 +58,7 @@ def test_parabolic_growth_ends_exactly_at_its_target(tiny_scene, tmp_path):
 
 
 def times(scene, factor, folder):
-    """A copy of a scene in other units of length, beside the same photographs."""
+    """Copy a scene, with the same photographs, and convert it to other units of length."""
     shutil.copytree(scene, folder)
     for file in folder.glob("transforms_*.json"):
         data = json.loads(file.read_text())

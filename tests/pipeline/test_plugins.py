@@ -447,7 +447,7 @@ def test_public_module_exports_all_imports():
 
 def test_rule_and_the_stage_of_the_examples_act(tiny_scene, tmp_path):
     plugins.load_file(EXAMPLES / "random_pruning.py")
-    rules = "[{type: prune_at_random, share: 0.9, opacity_below: 0.9}]"
+    rules = "[{type: prune_at_random, fraction: 0.9, opacity_below: 0.9}]"
     stages = f"{{densify: {{every: 10, start: 15, rules: {rules}}}}}, {{cap_size: {{every: 10, max_size: 0.001}}}}"
     plain = train(tiny_scene, tmp_path / "plain")
     run = train(tiny_scene, tmp_path / "run", f"optimize.during=[{stages}]")

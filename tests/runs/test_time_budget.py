@@ -31,7 +31,7 @@ def test_steps_follow_from_a_rehearsal():
 @pytest.mark.parametrize("minutes", [2.0, 10.0, 60.0])
 @pytest.mark.parametrize(("growth", "until_share"), [(0.0, 0.5), (3.0, 0.5), (3.0, 0.9), (30.0, 0.5)])
 def test_run_takes_the_given_time(monkeypatch, minutes, growth, until_share):
-    """By a made-up clock: steps take longer as Gaussians grow, in long trainings more than in a rehearsal."""
+    """By a made-up clock: steps take longer as Gaussians grow, more in a long training run than in a rehearsal."""
     clock, done, planned = [0.0], [0], list[int]()
 
     def cost(step: int, steps: int) -> float:

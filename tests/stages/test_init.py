@@ -1,4 +1,4 @@
-"""A second `init` between two trainings starts over."""
+"""A second `init` between two training stages starts over."""
 
 import pytest
 

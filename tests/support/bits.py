@@ -1,12 +1,12 @@
-"""Hash what short trainings write, to compare the bits of two programs.
+"""Hash the models that short training runs write, to compare the bits of two programs.
 
     python -m tests.support.bits [NAME ...] [--out FILE] [--jobs N] [--list]
 
 prints a line `NAME SHA256` for each case, in the order of the names.  The hash is that of a PLY file's data, without
-its header, which holds the version, or of the tables of a field.  Cases are all recipes in `pipelines/`, in STEPS steps
-with growth, and trainings with settings that no recipe has.  All runs are started from the command line, so that this
-file serves before and after modules move.  Counts and skipped cases go to standard error.  Real scenes are read from
-$CLSPLAT_DATA, or from `shared/data` beside the checkout.
+its header, which contains the version, or of the tables of a field.  Cases are all recipes in `pipelines/`, with STEPS
+steps and growth, and training runs with settings that no recipe has.  All runs are started from the command line, so
+that this file works before and after modules move.  Counts and skipped cases go to standard error.  Real scenes are
+read from $CLSPLAT_DATA, or from `shared/data` next to the checkout.
 """
 
 import argparse
@@ -45,7 +45,7 @@ DATA = Path(os.environ.get("CLSPLAT_DATA") or ROOT.parent / "shared" / "data")
 STEPS = 60
 EDITS_EVERY = 10  # at least: growth doubles with each
 STEP_KEYS = {"steps", "start", "stop", "until", "over", "every", "warm_up", "grow_until"}
-FEW_GAUSSIANS = 3000  # of a budget: trainings reach it
+FEW_GAUSSIANS = 3000  # of a budget: training reaches it
 OPAQUE = 0.3  # so few steps do not recover from faint Gaussians
 SIZES = {"rays": 64, "coarse_samples": 16, "fine_samples": 16, "width": 64, "color_width": 32, "entries": 4096}
 ONE_THREAD = {"POCL_MAX_PTHREAD_COUNT": "1", "POCL_CPU_MAX_CU_COUNT": "1", "CL_CONFIG_CPU_TBB_NUM_WORKERS": "1"}
@@ -173,11 +173,11 @@ def cases() -> dict[str, Case]:
 
 
 def shorten(recipe: dict[str, Any]) -> dict[str, Any]:
-    """Return a recipe in STEPS steps; the places of its settings stay."""
-    trainings = [
+    """Return a recipe with STEPS steps.  The key paths of its settings do not change."""
+    training_stages = [
         stage for stage in recipe["stages"] if isinstance(stage, dict) and "during" in next(iter(stage.values()))
     ]
-    factor = STEPS / next(iter(trainings[0].values()))["steps"]
+    factor = STEPS / next(iter(training_stages[0].values()))["steps"]
     short: dict[str, Any] = scaled(recipe, factor)
     short.pop("prepare", None)
     dropped = ("evaluate", "render", "viewer", "report")

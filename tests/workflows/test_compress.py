@@ -310,9 +310,9 @@ def test_palette_averages_start_midway_through_training(steps, lengths, starts, 
     model = clsplat.load(few_steps / "point_cloud.ply")
     tuning = Tuning("compress", ModelSource.from_model(few_steps, None), model, steps, None)
     settings = tuning.pipeline(SOG_STAGES, {"init.file": str(few_steps / "point_cloud.ply")}).settings
-    trainings = [stage for stage in settings.stages if stage.stage == "optimize"]
-    assert tuple(training.steps for training in trainings) == lengths
-    assert tuple(training.during[-1].start for training in trainings) == starts
+    stages = [stage for stage in settings.stages if stage.stage == "optimize"]
+    assert tuple(stage.steps for stage in stages) == lengths
+    assert tuple(stage.during[-1].start for stage in stages) == starts
 
 
 @pytest.mark.parametrize("steps", [19, 1, 0, -5])
