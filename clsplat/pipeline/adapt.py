@@ -95,7 +95,7 @@ class Photos(Adaptation):
         yield Decision(key="optimize.modules.random_background", value=random, reason=reason, matters=few and has_alpha)
 
         # The modules log what they choose for the sky and for exposures.
-        sky = {"type": "auto", "photographs": 0.25} if measures.photographs >= MIN_FOR_SKY else None
+        sky = {"type": "auto"} if measures.photographs >= MIN_FOR_SKY else None
         reason = "a sky, if they show one" if sky else "too few for a sky"
         yield Decision(key="model.background", value=sky, reason=f"{count}: {reason}", matters=False)
 
