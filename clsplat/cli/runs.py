@@ -86,7 +86,7 @@ def resume(
             min=1,
             metavar="N",
             help="Train up to this step; the result equals that of a run of this length, unless a reset or pruning "
-            "was due at the old last step.",
+            "was due at the former last step.",
         ),
     ] = None,
     set_: SetOption = None,

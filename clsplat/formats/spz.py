@@ -491,7 +491,7 @@ def _read_axes(path: Path, read: Callable[[int], bytes]) -> str:
             data = read(4) if length == 4 else b""
             if len(data) < 4 or (number := int.from_bytes(data, "little")) > len(AXES):
                 raise DataError(
-                    f"{path}: its record of axes has {length} bytes with {data.hex() or 'nothing'}; expected 4 bytes "
+                    f"{path}: its axes record has {length} bytes, {data.hex() or 'nothing'}; expected 4 bytes "
                     f"with a number from 0 to {len(AXES)}; export it again"
                 )
             axes = AXES[number - 1] if number else ""
