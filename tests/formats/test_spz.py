@@ -156,7 +156,7 @@ def test_unknown_extensions_are_skipped(tmp_path):
     assert len(read(path)) == 2
     long = struct.pack("<2I", 7, 200_000) + bytes(200_000)
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=long + struct.pack("<2II", 0xADBE0003, 4, 17))))
-    with pytest.raises(DataError, match="its record of axes has 4 bytes with 11000000; expected 4 bytes with a number"):
+    with pytest.raises(DataError, match="its axes record has 4 bytes, 11000000; expected 4 bytes with a number"):
         read(path)
     damaged = bytearray(gzip.compress(legacy(2, flags=2, rest=other)))
     damaged[-5] ^= 1  # of the checksum, which is read with the records
@@ -164,7 +164,7 @@ def test_unknown_extensions_are_skipped(tmp_path):
     with pytest.raises(DataError, match="incorrect data check"):
         read(path)
     path.write_bytes(gzip.compress(legacy(2, flags=2, rest=other + struct.pack("<2IH", 0xADBE0003, 2, 1))))
-    with pytest.raises(DataError, match="its record of axes has 2 bytes with nothing"):
+    with pytest.raises(DataError, match="its axes record has 2 bytes, nothing"):
         read(path)
 
 
