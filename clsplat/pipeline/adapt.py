@@ -57,10 +57,10 @@ class Adaptation(Settings):
 
 FEW = 40  # training photos; the hull of fewer silhouettes is too large
 DROPOUT, MAX_DROPOUT = 0.25, 0.2  # probabilities for no photo, decreasing linearly to 0 at FEW photos, and at most
-DROPOUT_UNTIL = 0.43  # fraction of the training steps over which the probability rises
+DROPOUT_UNTIL = 1460 / 3400  # fraction of the training steps over which the probability rises
 MIN_FOR_SKY = 12  # training photos; fewer show too little of the background
 MAX_ERROR = 1.0  # px, mean reprojection error at the training size; poses are optimized if it is this large
-POSES_START = 0.15  # fraction of the training steps after which poses are optimized
+POSES_START = 500 / 3400  # fraction of the training steps after which poses are optimized
 
 
 class Photos(Adaptation):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from clsplat.core.errors import ConfigError, quote, shell_quote
 from clsplat.core.files import PIPELINE
+from clsplat.core.reading import read_file
 from clsplat.core.resources import resource_dir
 
 ENDINGS = {"short": "_7k", "draft": "_draft", "high": "_high"}  # of the names of variants, by their key in the file
@@ -40,7 +41,7 @@ def variant_key(path: Path) -> str | None:
 def variant_of(name: str, key: str) -> str:
     """Return the name or path of a variant, given those of its pipeline.  Raises ConfigError."""
     path = find(name)
-    if key.encode() not in VARIANT_KEY.findall(origin(path).read_bytes()):
+    if key.encode() not in VARIANT_KEY.findall(read_file(origin(path), "a pipeline file", ConfigError)):
         raise ConfigError(f"{name}: has no variant '{key}'; use a pipeline that has one, such as `photos`")
     return str(Path(name).with_stem(path.stem + ENDINGS[key]))
 

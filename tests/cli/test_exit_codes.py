@@ -247,5 +247,5 @@ def test_too_long_output_name_is_an_output_error(tmp_path):
 def test_too_little_address_space_is_refused_at_the_start(monkeypatch):
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(resource, "getrlimit", lambda number: (500 << 20, 500 << 20))
-    message = "limits clsplat to 500 MiB of address space; libraries crash with less than 1024: raise it"
+    message = "limits clsplat to 500 MiB of address space; libraries crash with less than 1024 MiB: raise the limit"
     assert message in clsplat("pipelines", expect=5).stderr

@@ -63,7 +63,7 @@ def test_photos_recipe_shortens_schedules_with_steps():
     pipeline = load("photos")
     short = replace(pipeline, settings=stretch_to_steps(pipeline.settings, 1700))
     modules = {module.type: module for module in apply_adaptation(short, Measures(9, 2.0)).settings.optimize.modules}
-    assert (modules["camera_optimizer"].start, modules["exposure"].min_spread) == (255, 0.03)
+    assert (modules["camera_optimizer"].start, modules["exposure"].min_spread) == (250, 0.03)
 
 
 @pytest.mark.parametrize(

@@ -57,14 +57,11 @@ def test_time_estimates_scale_with_the_work(photos):
     assert lines[-1].split()[1:4] == ["0.1", "to", "4.4"]
 
 
-def test_estimated_growth_follows_the_number_of_images(photos):
-    """Whether they show a sky is not known before they are prepared."""
+def test_estimated_growth_follows_the_limit_per_pixel(photos):
     for path in photos.iterdir():
         cv2.imwrite(str(path), np.zeros((120, 160, 3), np.uint8))
-    lines = expected("photos", photos)
+    lines = expected("photos", photos, "optimize.during.1.per_pixel=0.6")
     assert "with 5,000 to 11,520 Gaussians at 160x120 px" in lines[-1], "0.6 for each pixel"
-    for number in range(COUNT, 2 * COUNT + 1):
-        cv2.imwrite(str(photos / f"{number:02d}.png"), np.zeros((120, 160, 3), np.uint8))
     assert "11,520" not in expected("photos", photos)[-1]
 
 
