@@ -74,5 +74,5 @@ def test_gradient_of_depth_needs_a_model_at_rest(device):
     model = Model(**tables, motion=np.zeros((len(tables["means"]), 5)), rendering=Rendering(near=camera.near))
     lens = Camera(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     result = Renderer(model, device).render(View("oracle", lens, camera.pose))
-    with pytest.raises(ValueError, match="does not move"):
+    with pytest.raises(ValueError, match="static model"):
         result.backward(depth=np.ones((camera.height, camera.width)))

@@ -85,10 +85,10 @@ def test_wrong_rows_are_refused_and_change_nothing(device, rng, verb, case):
 WRONG_CHOICES = {
     "indices": ((np.arange(3), 0, 0), r"chosen: expected a mask, bool \[150\], got int64 \[3\]"),
     "a short mask": ((np.ones(149, bool), 0, 0), r"chosen: expected a mask, bool \[150\], got bool \[149\]"),
-    "negative copies": ((np.ones(COUNT, bool), -1, 0), "copies: expected a number of rows, 0 or more, got -1"),
+    "negative copies": ((np.ones(COUNT, bool), -1, 0), "copies: expected a row count of 0 or more, got -1"),
     "one negative number": (
         (np.ones(COUNT, bool), np.arange(COUNT) - 2, 0),
-        "copies: expected a number of rows, 0 or more, got -2",
+        "copies: expected a row count of 0 or more, got -2",
     ),
     "short copies": (
         (np.ones(COUNT, bool), np.ones(3, int), 0),
@@ -97,11 +97,11 @@ WRONG_CHOICES = {
     "copies with a fraction": ((np.ones(COUNT, bool), 1.5, 0), "copies: expected an integer or .*, got float64"),
     "copies beyond 32 bits": (
         (np.arange(COUNT) == 7, np.full(COUNT, 2**32), 0),
-        "copies: expected a number of rows, at most 4294967294, got 4294967296",
+        "copies: expected a row count of at most 4294967294, got 4294967296",
     ),
     "negative number of old rows": (
         (np.ones(COUNT, bool), 2, -1),
-        "old_rows: expected a number of rows, 0 or more, got -1",
+        "old_rows: expected a row count of 0 or more, got -1",
     ),
 }
 
@@ -119,7 +119,7 @@ def test_invalid_selection_is_refused(device, rng, case):
 @pytest.mark.parametrize("numbers", [{"copies": -1, "old_rows": 0}, {"copies": 2, "old_rows": -1}])
 def test_negative_row_counts_are_refused(device, rng, numbers):
     edit = edit_of(gaussians_of(device, rng))
-    with pytest.raises(ValueError, match="expected a number of rows, 0 or more, got -1"):
+    with pytest.raises(ValueError, match="expected a row count of 0 or more, got -1"):
         edit.mark(**numbers)
 
 

@@ -413,7 +413,7 @@ def test_photographs_that_show_nothing_stop_inspection_and_run(scene, kind, capl
         inspection = Inspection.from_folder(scene)
     with pytest.raises(DataError) as error:
         RunScene.from_scene(SceneSettings(path=str(scene)), read_scene(scene))
-    words = "masks exclude every pixel of 1 photo" if kind == "mask" else "no photo shows anything"
+    words = "masks exclude every pixel of 1 photo" if kind == "mask" else "all photos are blank"
     assert words in str(error.value)
     assert inspection.verdict.startswith(f"cannot train: {words}")
 

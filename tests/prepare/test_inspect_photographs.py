@@ -83,8 +83,8 @@ def test_blank_photographs_are_refused_as_in_preparation(tmp_path, level):
         cv2.imwrite(str(photos / f"{i}.png"), np.full((48, 64, 3), level, np.uint8))
     inspection = Inspection.from_folder(photos)
     assert inspection.next_step is None
-    assert inspection.verdict.startswith("cannot train: no photo shows anything (0.png, 1.png")
-    with pytest.raises(DataError, match="no photo shows anything"):
+    assert inspection.verdict.startswith("cannot train: all photos are blank (0.png, 1.png")
+    with pytest.raises(DataError, match="all photos are blank"):
         gather(photos, tmp_path / "linked", list_photographs(photos))
     photograph(photos / "9.png")
     assert "9 photos are black or of a single color" in Inspection.from_folder(photos).verdict

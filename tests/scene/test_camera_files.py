@@ -133,7 +133,7 @@ def test_nerfstudio_has_validation_views_and_one_lens_model(scene_of, tmp_path):
 
 def test_nerfstudio_refuses_mixed_lens_models(scene_of, tmp_path):
     views = [scene_of("OPENCV").views[0], scene_of("OPENCV_FISHEYE").views[4]]
-    with pytest.raises(DataError, match=r"right/4\.png: is OPENCV_FISHEYE, other views are OPENCV"):
+    with pytest.raises(DataError, match=r"right/4\.png: has the camera model OPENCV_FISHEYE, other views have OPENCV"):
         clsplat.write_cameras(make_scene(tmp_path, views, set(), None), tmp_path / "out", "nerfstudio")
 
 

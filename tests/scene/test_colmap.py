@@ -206,7 +206,7 @@ def test_largest_model_is_used_and_others_are_logged(tmp_path: Path, caplog: pyt
     (tmp_path / "images" / "c.jpg").touch()
     with caplog.at_level(logging.INFO, "clsplat"):
         assert len(read_scene(tmp_path).views) == 3
-    assert "sparse/1: the largest model, with 3 images, is used" in caplog.text
+    assert "sparse/1: using the largest model, with 3 images" in caplog.text
     assert "sparse/0 (2)" in caplog.text
 
 

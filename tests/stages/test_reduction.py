@@ -318,7 +318,7 @@ def test_palette_training_resumes_with_the_same_bits(palette_run, varied_harmoni
 def test_share_palette_needs_a_palette(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("name: x\nstages:\n  - init\n  - share_palette\n")
-    with pytest.raises(ConfigError, match=r"share_palette needs 'palette', .* \(made by palette_sh\)"):
+    with pytest.raises(ConfigError, match=r"share_palette needs 'palette', .* add palette_sh"):
         load_pipeline(str(path))
 
 

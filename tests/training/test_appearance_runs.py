@@ -79,7 +79,7 @@ def test_run_folder_is_also_measured_in_image_colors(with_gains, few_steps, tmp_
     assert "psnr_color" not in evaluate(few_steps)["test"]["1"]
     for damage in ("[]", '{"type": "lens"}'):
         (tmp_path / "view_colors.json").write_text(damage)
-        with pytest.raises(DataError, match=r"unknown type .* expected \w+"):
+        with pytest.raises(DataError, match=r"unknown color type .* expected \w+"):
             read_color_model(tmp_path / "point_cloud.ply")
 
 

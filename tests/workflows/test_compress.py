@@ -192,7 +192,7 @@ def test_interrupted_search_resumes_when_repeated(few_steps, tmp_path, monkeypat
 
 
 def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
-    with pytest.raises(ConfigError, match="a search that differs in steps; remove it or use another --out"):
+    with pytest.raises(ConfigError, match="a search that differs in steps; remove it, or use another --out"):
         clsplat.compress_model(few_steps, target="1MB", out=searched, keep=KEEP, steps=STEPS + 1)
     (tmp_path / "own.txt").write_text("mine")
     with pytest.raises(ConfigError, match="contains files that are not part of a search"):

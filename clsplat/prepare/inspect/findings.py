@@ -70,7 +70,7 @@ def _check_capture(facts: Facts, readable_count: int) -> Iterator[Finding]:
     if blank := facts.comparison.blank:
         is_all_blank = len(blank) == readable_count
         blank_text = f"{_are(len(blank), 'photo')} black or of a single color"
-        fault = "no photo shows anything" if is_all_blank else blank_text
+        fault = "all photos are blank" if is_all_blank else blank_text
         yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")
 
 
