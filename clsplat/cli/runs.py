@@ -43,7 +43,7 @@ def run(
     live: LiveOption = None,
     minutes: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Choose the number of steps to fit this time, within about 15 %."),
+        typer.Option(metavar="M", help="Choose the number of steps so that the run takes M minutes, within about 15%."),
     ] = None,
     quality: Annotated[
         Literal["draft", "standard", "high"],

@@ -209,7 +209,7 @@ def examine(device: str | Device | None = None) -> DeviceReport:
     info = device.info if isinstance(device, Device) else choose(device)
     default = resolve_schedule(info, "auto")
     report, start_time = DeviceReport(info, default), time.perf_counter()
-    LOG.info("device: %s; this takes a minute or two on a CPU", info.text)
+    LOG.info("checking %s; this takes a minute or two on a CPU", info.text)
     for schedule in SCHEDULES:
         if not _is_due(schedule, report):
             continue

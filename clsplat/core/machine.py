@@ -51,7 +51,7 @@ def cache_folder() -> Path:
         os.environ["POCL_CACHE_DIR"] = str(base / "pocl")
     folder = base / "clsplat"
     if fault := _write_fault(folder):
-        raise OutputError(f"{fault}; free space, or set TMPDIR to a writable folder")
+        raise OutputError(f"{fault}; free up space, or set TMPDIR to a writable folder")
     return folder
 
 

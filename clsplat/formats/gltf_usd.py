@@ -174,8 +174,8 @@ class Gltf:
         kind, count, start = COMPONENTS[row["componentType"]], _index(row["count"]), _index(row.get("byteOffset", 0))
         if WIDTHS.get(row["type"]) != width or "sparse" in row or "bufferView" not in row:
             raise DataError(
-                f"{self.path}: accessor {number} is a {quote(row['type'])}, sparse, or without data; expected {width} "
-                "numbers per row in a buffer; export it again without compression"
+                f"{self.path}: accessor {number} has type {quote(row['type'])}, and may be sparse or without data; "
+                f"expected {width} numbers per row in a buffer; export it again without compression"
             )
         size = width * np.dtype(kind).itemsize
         data, offset, length, stride = self._view(row["bufferView"], size)

@@ -370,8 +370,8 @@ def require_memory(path: Path, count: int, degree: int = MAX_DEGREE) -> None:
     size, free = 4 * count * (11 + 3 * sh_coefficients(degree)), available_memory()
     if free is not None and size > free:
         raise MemoryLimitError(
-            f"{path}: declares {count:,} Gaussians, which take {size / 2**30:.1f} GiB of memory, but "
-            f"{free / 2**30:.1f} GiB are free; use a machine with more memory, or a smaller model"
+            f"{path}: declares {count:,} Gaussians, which need {size / 2**30:.1f} GiB of memory, but only "
+            f"{free / 2**30:.1f} GiB is free; use a machine with more memory, or a smaller model"
         )
 
 

@@ -65,7 +65,7 @@ class HostLoss(ImageLoss):
             value, derivative = float(value), np.asarray(derivative, np.float32)
         except (TypeError, ValueError):
             raise ValueError(
-                f"the loss '{self.name}' returned {quote(result)}; expected (value, gradient of the image)"
+                f"the loss '{self.name}' returned {quote(result)}; expected (value, gradient with respect to the image)"
             ) from None
         if derivative.shape != image.shape:
             raise ValueError(

@@ -135,7 +135,7 @@ def _parse_field(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel
         first = error.errors()[0]
         raise DataError(f"metadata {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     if arrays.keys() != {PARAMETERS}:
-        raise DataError(f"expected only the array {PARAMETERS}")
+        raise DataError(f"expected only the array '{PARAMETERS}'")
     table = arrays[PARAMETERS]
     if table.dtype != np.float32 or table.shape != (meta.shape.parameters, 1):
         raise DataError(f"{PARAMETERS} are not [{meta.shape.parameters}, 1] float32")

@@ -88,9 +88,9 @@ class LearnedField(TrainedField):
         parameters = _parse_shape(shape).parameters
         for name, table in tables.items():
             if table.dtype != np.float32 or table.shape != (parameters, 1):
-                raise DataError(f"{name} of its field is not [{parameters}, 1] float32")
+                raise DataError(f"the table '{name}' of its field is not [{parameters}, 1] float32")
             if not np.isfinite(table).all():
-                raise DataError(f"{name} of its field contains values that are not finite")
+                raise DataError(f"the table '{name}' of its field contains values that are not finite")
 
     @property
     def painter(self) -> Field:

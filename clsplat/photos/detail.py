@@ -57,7 +57,7 @@ class Spectrum:
 def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Floats, Floats]:
     """Return the steps and the downscale factors of a schedule, which fall from at most `largest` to 1 at `until`.
 
-    Each increment of the amplitudes takes fewer steps than the previous one.  If there is no detail to gain, the
+    Equal increments of the summed spectral amplitudes take fewer and fewer steps.  If there is no detail to gain, the
     factor is always 1.
     """
     first_divisor = min(largest, *(spectrum.divisor(MIN_FRACTION * spectrum.total) for spectrum in spectra))

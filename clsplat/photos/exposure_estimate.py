@@ -2,8 +2,8 @@
 
 For each channel, a pixel y is modeled by ln y = e + a, where e is the exposure of the photograph and a is the color of
 the point.  The estimate minimizes the sum of |ln y - e - a| exp(a), which is robust to hidden, glossy, or misplaced
-points.  The factor exp(a) weights differences by their size in the image, where haze on a dark point is small.  The
-solver is iteratively reweighted least squares with conjugate gradients.  All sums have a fixed order.
+points.  The factor exp(a) converts log differences to pixel differences, so that haze on a dark point counts little.
+The solver is iteratively reweighted least squares with conjugate gradients.  All sums have a fixed order.
 """
 
 import math

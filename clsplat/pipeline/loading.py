@@ -53,7 +53,7 @@ class Pipeline:
 
     @property
     def reasons(self) -> list[str]:
-        """The reasons of the decisions that change this run."""
+        """The reasons for the decisions that change this run."""
         return [decision.reason for decision in self.decisions if decision.matters]
 
     @property

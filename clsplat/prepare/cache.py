@@ -195,7 +195,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def _sizes(folder: Path) -> dict[str, int]:
-    """Return the sizes of the files below a folder in bytes, by relative path, without the record.
+    """Return the sizes in bytes, by relative path, of all files below a folder except the record.
 
     Links, such as links to photographs, are followed.
     """

@@ -97,7 +97,7 @@ def _conversion_hints(unreadable_names: list[str]) -> list[str]:
 
 
 def _photo_names(folder: Path, excluded_folder: Path | None) -> tuple[list[str], list[str]]:
-    """Return the sorted names of the photographs below a folder, and the names of photographs in other formats."""
+    """Return the sorted names of the photographs below a folder, and those in formats that cannot be read."""
     require_folder(folder)
     names: list[str] = []
     unreadable_names: list[str] = []

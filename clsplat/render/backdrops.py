@@ -19,7 +19,7 @@ class Backdrop(Settings):
 
 
 class EnvironmentMap(Backdrop):
-    """Learn a sky: a color for each direction, infinitely far away, together with the Gaussians.
+    """Learn a sky together with the Gaussians: a color for each direction, infinitely far away.
 
     A pixel has the color C + T b, where C is the blended color of the Gaussians, T their transmittance, and b the map's
     color in the direction of the pixel's ray.  The map is octahedral with bilinear interpolation, and has

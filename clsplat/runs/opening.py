@@ -268,7 +268,7 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
 
 
 def with_lengths(pipeline: Pipeline, scene: Scene) -> Pipeline:
-    """Return the pipeline with its `auto` lengths, the near plane and the units of fields, resolved from the scene."""
+    """Return the pipeline with its `auto` lengths (the near plane and the units of fields) resolved from the scene."""
 
     def with_unit(training: TrainField) -> TrainField:
         return training.model_copy(update={"field": training.field.with_unit(scene)})

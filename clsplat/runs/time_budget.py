@@ -96,7 +96,7 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
         )  # stages that start after the last edit run once
         steps = max(report.step + 2, minimum, old_steps + change)
         reason = f"--minutes {minutes:g}: {steps:,} steps, corrected at step {report.step:,}"
-        LOG.info("%s: %.0f ms", reason, report.milliseconds)
+        LOG.info("%s; %.0f ms per step", reason, report.milliseconds)
         return replace(plan, settings=with_steps(plan.settings, steps, report.step), reason=reason)
 
     for fraction in CORRECTIONS:

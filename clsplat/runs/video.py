@@ -132,7 +132,9 @@ def _scene(
     except DataError as error:
         if is_required or scene is not None:
             raise
-        LOG.warning("%s; continuing without a scene, with the background of the model and the size of the path", error)
+        LOG.warning(
+            "%s; continuing without a scene, using the model's background and the image size in the path file", error
+        )
         return None
     return source.scene(host_model).downscaled(source.settings.downscale if downscale is None else downscale)
 

@@ -134,7 +134,7 @@ def _view(frame: JsonFrame, number: int) -> View:
 def _array(frame: JsonFrame, key: str, shape: tuple[int, ...]) -> Floats:
     array = frame.array(key)
     if array.shape != shape or not np.isfinite(array).all():
-        raise DataError(f"{frame.source}: {key} is {quote(frame.value(key))}; expected finite numbers, {shape}")
+        raise DataError(f"{frame.source}: {key} is {quote(frame.value(key))}; expected finite numbers of shape {shape}")
     return array
 
 

@@ -223,7 +223,8 @@ class _Binary:
     def finish(self) -> None:
         if self.offset < len(self.data):
             raise DataError(
-                f"{self.source}: {len(self.data) - self.offset} bytes follow the last record; damaged: {REMEDY}"
+                f"{self.source}: the file is damaged: {len(self.data) - self.offset} bytes follow the last record; "
+                f"{REMEDY}"
             )
 
 

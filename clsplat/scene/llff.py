@@ -98,7 +98,7 @@ def view_from_row(path: Path, row: NDArray[np.float64], image: Path) -> View:
         )
     rotation = matrix[:, :3] @ LLFF_TO_OPENCV
     if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
-        raise DataError(f"{path}: the pose of {image.name} has no rotation; export the file again")
+        raise DataError(f"{path}: the 3x3 part of the pose of {image.name} is not a rotation; export the file again")
     camera_to_world = np.vstack([np.hstack([rotation, matrix[:, 3:4]]), [0, 0, 0, 1]])
     camera = Camera(header.width, header.height, focal * scale, focal * scale, header.width / 2, header.height / 2)
     return View(image.name, camera, np.linalg.inv(camera_to_world)[:3], image, camera_to_world=camera_to_world)

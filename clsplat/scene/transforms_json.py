@@ -146,7 +146,8 @@ class FrameFiles(FileLookup):
     def view(self, i: int, clock: Clock | None = None) -> View:
         """Return the view of the i-th frame; without a size in the frame, it has the size of its photograph.
 
-        Photographs of lenses with distortion are undistorted when they are read.  Raises DataError for invalid values.
+        Photographs taken with a distorting lens are undistorted when they are read.  Raises DataError for invalid
+        values.
         """
         frame, path, masks = self.frames[i], self.paths[i], [files.get(i) for files in self.masks.values()]
         size = None

@@ -252,7 +252,10 @@ class Split:
         if self.train is not None:
             remaining = _select_training(scene, "train", self.train, folders) | set(scene.test)
             if remaining == set(scene.test):
-                raise DataError(f"{scene.path}: scene.train leaves no photo to train on; expected some")
+                raise DataError(
+                    f"{scene.path}: scene.train leaves no photo to train on; "
+                    "select at least one that is not a test photo"
+                )
             LOG.info("scene.train leaves out %s", pluralize(len(scene.views) - len(remaining), "photo"))
             views = [view for i, view in enumerate(scene.views) if i in remaining]
             left_out_names = [view.name for i, view in enumerate(scene.views) if i not in remaining]

@@ -22,7 +22,10 @@ DISTANCE = 2.2  # of the start view from the center of the box, in halves of its
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The start view of the viewer and the frame of its motion, in scene units."""
+    """The initial view of the viewer, with the pivot and up vector of its motion.
+
+    Lengths are in scene units, except `focal`.
+    """
 
     pivot: NDArray[np.floating]  # [3]
     up: NDArray[np.floating]  # [3], unit

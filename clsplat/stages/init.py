@@ -75,7 +75,7 @@ def sample_hull(run: Run, count: int) -> PointCloud | None:
     """Return at most `count` points on the visual hull, or None, with a warning, if there are too few."""
     points = hull_points(_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
     if len(points) < MIN_USABLE:
-        remedy = "silhouettes need transparency around the object, and no masks; or use init: {source: sweep}"
+        remedy = "it needs photos with a transparent background and no mask files; otherwise, use init: {source: sweep}"
         LOG.warning("the visual hull has only %d points; starting from random ones; %s", len(points), remedy)
         return None
     return points

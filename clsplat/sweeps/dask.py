@@ -211,7 +211,7 @@ class Cluster:
         elif now - self._last_worker > NO_DEVICE_TIMEOUT_S:
             hint = f" ({len(workers)} of another version get no cells)" if workers else ""
             raise DeviceError(
-                f"no worker of this version connected for {NO_DEVICE_TIMEOUT_S:.0f} s{hint}; start some with "
+                f"for {NO_DEVICE_TIMEOUT_S:.0f} s, no worker of this version has been connected{hint}; start some with "
                 "`clsplat worker --scheduler ADDRESS`; the store keeps all progress"
             )
 

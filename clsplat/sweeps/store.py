@@ -563,6 +563,7 @@ class Store:
         keys = {key for key in keys if not self.folder(key).result.is_dir()} or keys
         keys = keys or {folder.key for folder in self.folders() if folder.key.startswith(cell)}
         if len(keys) != 1:
-            advice = f"{len(keys)} cells match; give a key" if keys else "`clsplat status` lists the cells"
-            raise ConfigError(f"{self.root}: no cell '{cell}'; {advice}")
+            several = f"'{cell}' matches {len(keys)} cells; give a key"
+            reason = several if keys else f"no cell '{cell}'; `clsplat status` lists the cells"
+            raise ConfigError(f"{self.root}: {reason}")
         return keys.pop()

@@ -64,7 +64,7 @@ def read(path: Path) -> tuple[Notes, Arrays]:
         )
         if isinstance(error, OSError) and error.errno == errno.EIO:
             raise DataError(f"it cannot be read from disk: {error.strerror}") from error
-        raise DataError("is empty" if is_empty else f"does not match its checksum ({reason})") from error
+        raise DataError("is empty" if is_empty else f"cannot be parsed ({reason})") from error
 
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
@@ -91,7 +91,7 @@ def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
     if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
         raise DataError("its contents are compressed or encrypted")
     if sum(max(member.file_size, member.compress_size) for member in members) > size:
-        raise DataError(f"it declares more bytes than the file has, {size}")
+        raise DataError(f"it declares more than the file's {size} bytes")
 
 
 def _notes(archive: zipfile.ZipFile) -> Notes:

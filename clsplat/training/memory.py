@@ -50,7 +50,7 @@ class MemoryPlan:
 
     @property
     def limit(self) -> int:
-        """The largest number of Gaussians that fits in the total memory and in single buffers."""
+        """The largest number of Gaussians that fits in the total memory, with each table in one buffer."""
         by_total = (self.memory - self.fixed) / self._per_gaussian
         by_table = self.allocation // self.largest_table // ALIGNMENT * ALIGNMENT
         by_pairs = self.allocation / (PAIRS_PER_GAUSSIAN * 4 * RECORD)

@@ -207,7 +207,7 @@ class Run:
     ) -> MemoryPlan:
         """Plan the device memory for training with the current tables, or those in `components`.
 
-        harmonics: where the bands above 0 are stored; None for their current location; visible: as in `plan`.
+        harmonics: where the bands above 0 are stored; None for their current location.  visible: as in `plan`.
         """
         if harmonics is None:
             harmonics = "host" if self.model.gaussians.on_host else "device"

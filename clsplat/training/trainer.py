@@ -154,7 +154,8 @@ class StepTrainer:
         """Update the parameters and add the penalties to the view's losses.
 
         Returns the gradient of the projected means, [2, S] px⁻¹.  If there are no penalties, stale parameters, motion,
-        depths, or gradients of several views, a fused kernel updates without writing gradients to memory.
+        depths, or gradients of several views, a fused kernel updates the parameters without writing gradients to
+        memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view.comparison.step

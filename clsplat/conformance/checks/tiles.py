@@ -39,7 +39,7 @@ def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
 
 
 def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, ...], max_key: int) -> Results:
-    """Compare a sort of each tile's pairs, by depth key and then by index.
+    """Check the sort of each tile's pairs by depth key and then by index.
 
     lengths: number of pairs in each tile; max_key: bound on the depth keys, exclusive.
     """

@@ -114,7 +114,7 @@ class CameraOptimizer(TrainingModule):
 
     @classmethod
     def apply_side_files(cls, model: Path, scene: Scene) -> Scene:
-        """Return a scene, at full size, with the poses and focal lengths in the side file next to a model."""
+        """Return `scene`, which must be at full size, with the poses and focal lengths of a model's side file."""
         path = model.with_name(VIEW_POSES)
         if not path.is_file():
             return scene

@@ -99,7 +99,7 @@ class TransientsState(ModuleState):
 def measure_residuals(
     workspace: Workspace, camera: DeviceCamera, image: Array, photograph: Array, mask: Array | None
 ) -> tuple[Array, Callable[[], NDArray[np.uint32]]]:
-    """Return the residuals, [1, rows, stride], and a function that waits for their counts, [BINS], and returns them.
+    """Return the residuals, [1, rows, stride], and a function that waits for their histogram, [BINS], and returns it.
 
     image, photograph: planes, [3, rows, stride]; mask: [1, rows, stride], 1 in unmasked pixels, or None.
     """

@@ -247,7 +247,7 @@ def even_size(camera: Camera) -> Size:
 
 
 def same_area(camera: Camera, size: Size) -> Camera:
-    """Return a camera with another image size that views an equally large area, and a centered principal point."""
+    """Return a camera with this image size and a centered principal point that views an equally large area."""
     width, height = size
     scale = math.sqrt(width * height / (camera.width * camera.height))
     return Camera(width, height, camera.fx * scale, camera.fy * scale, width / 2, height / 2)
