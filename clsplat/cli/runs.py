@@ -47,7 +47,7 @@ def run(
     ] = None,
     quality: Annotated[
         Literal["draft", "standard", "high"],
-        typer.Option(help="For `photos`: `draft` for a first look, `high` for the best result."),
+        typer.Option(help="For `photos`: `draft` for a first look, `high` for larger images and more steps."),
     ] = "standard",
     on: OnOption = None,
 ) -> None:
