@@ -42,6 +42,9 @@
 #ifndef INVERSE_DEPTH
 #define INVERSE_DEPTH 0  // 1: the image has a fourth plane, the blended inverse depth (splat.h)
 #endif
+#ifndef MEDIAN_DEPTH
+#define MEDIAN_DEPTH 0  // 1: red is the depth of each splat, and the third plane is the median depth (splat.h)
+#endif
 #ifndef GRAD_BEHIND
 #define GRAD_BEHIND 0  // 1: the loss depends on the transmittance of a pixel in addition to its color (splat.h)
 #endif

@@ -4,7 +4,7 @@
 #include "splat.h"
 
 /* Set red to the depth of the mean, green to 1, blue to 0; blended on black, red is the mean depth times alpha and
- * green is alpha. */
+ * green is alpha, and with MEDIAN_DEPTH (splat.h) blue is the median depth. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void paint_depth(
     __global const float *restrict means,      // [3,S] scene units

@@ -10,7 +10,10 @@
  * With PIXEL_BOX alpha is the mean of that Gaussian over the pixel instead (pixel_box.h), and must be >= 1/255.
  *
  * With INVERSE_DEPTH the image and its gradient have a fourth plane, D = sum_i w_i / z_i with w = alpha T and the
- * depths of the means; it is 0 behind the splats. */
+ * depths of the means; it is 0 behind the splats.
+ *
+ * With MEDIAN_DEPTH the third plane is not blended: it is the red of the splat that takes the transmittance from at
+ * least 1/2 to below 1/2, and 0 where no splat does.  depth.cl makes red the depth of the mean. */
 #ifndef CLSPLAT_SPLAT_H
 #define CLSPLAT_SPLAT_H
 #include "lanes.h"
@@ -170,7 +173,12 @@ static inline void blend(pixels_t *p, const row_splat_t s, const VF pixel, const
     const contribution_t k = contribution_of(s, pixel, p->t);
     p->red += k.weight * color[0];
     p->green += k.weight * color[1];
+#if MEDIAN_DEPTH
+    const VI crosses = k.blended & (p->t >= 0.5f) & (k.next < 0.5f);
+    p->blue = crosses ? (VF)(color[0]) : p->blue;
+#else
     p->blue += k.weight * color[2];
+#endif
 #if INVERSE_DEPTH
     p->inverse_depth += k.weight * color[SPLAT_INVERSE_DEPTH - SPLAT_RED];
 #endif

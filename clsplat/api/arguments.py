@@ -52,6 +52,13 @@ def to_path(value: PathLike | None) -> Path | None:
     return None if value is None else Path(value)
 
 
-def layer_names(depth: bool, alpha: bool) -> tuple[str, ...]:
-    """Return the names of the layers to render: "color", and "depth" and "alpha" if requested."""
-    return ("color", *(name for name, is_requested in (("depth", depth), ("alpha", alpha)) if is_requested))
+def layer_names(depth: bool | str, normals: bool, alpha: bool) -> tuple[str, ...]:
+    """Return the names of the layers to render: "color", and others if requested.  Raises ConfigError.
+
+    depth: "mean" or True, or "median"
+    """
+    depths = {False: None, True: "depth", "mean": "depth", "median": "median_depth"}
+    if depth not in depths:
+        raise ConfigError(f"depth: expected mean or median, got '{depth}'")
+    layers = {depths[depth]: True, "normals": normals, "alpha": alpha}
+    return ("color", *(name for name, is_requested in layers.items() if name and is_requested))

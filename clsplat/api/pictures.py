@@ -26,7 +26,8 @@ def render_views(
     split: Literal["test", "train", "all"] = "test",
     downscale: float | None = None,
     kind: Literal["png", "npy"] = "png",
-    depth: bool = False,
+    depth: bool | Literal["mean", "median"] = False,
+    normals: bool = False,
     alpha: bool = False,
     time: float | None = None,
     device: "str | Device | None" = None,
@@ -37,7 +38,10 @@ def render_views(
     scene: a dataset folder; default: the dataset of the run
     downscale: divisor of the image size; default: the downscale factor of the run, or 1 for a model file
     kind: "png" writes 8-bit images, "npy" float32 arrays, [height, width, 3]
-    depth, alpha: also write NAME_depth (scene units) and NAME_alpha (in [0, 1]), as arrays [height, width]
+    depth: also write NAME_depth, the mean depth (True or "mean"), or NAME_median_depth, the depth where transmittance
+        falls below ½ ("median"; 0: nowhere), in scene units, as arrays [height, width]
+    normals: also write NAME_normals, from the mean depth, in scene axes, as arrays [height, width, 3]; 0: unknown
+    alpha: also write NAME_alpha, in [0, 1], as arrays [height, width]
     time: render a moving model at this time, in [0, 1], instead of at the times of the views
     """
     from clsplat.runs.model_file import KINDS, SPLITS, ModelFile
@@ -47,7 +51,7 @@ def render_views(
         if value not in choices:
             raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
     model_file = ModelFile(Path(model), to_path(scene), device, downscale)
-    return model_file.render(split, Path(out), kind, layer_names(depth, alpha), time)
+    return model_file.render(split, Path(out), kind, layer_names(depth, normals, alpha), time)
 
 
 def render_path(
@@ -62,7 +66,8 @@ def render_path(
     size: Size | None = None,
     times: "str | float | tuple[float, float] | None" = None,
     side: PathLike | None = None,
-    depth: bool = False,
+    depth: bool | Literal["mean", "median"] = False,
+    normals: bool = False,
     alpha: bool = False,
     downscale: float | None = None,
     kind: Literal["png", "npy"] = "png",
@@ -82,7 +87,7 @@ def render_path(
     times: for a moving model, one time in [0, 1], or the times of the first and last frame, such as (0, 1) or "0..1";
         default: the full range, or the times of the views
     side: what to show in the right half: "photograph", the photo with the nearest camera, or another model
-    depth, alpha: also write videos of these layers
+    depth, normals, alpha: also write videos of these layers, as in `render_views`
 
     Raises ConfigError for a value out of range, a missing scene, or a file that must not be replaced; DataError for an
     unreadable file, or a path that the cameras do not permit; NumericError for images that are not finite; OutputError
@@ -96,7 +101,7 @@ def render_path(
         VideoRequest.parse(str(path), frames, fps, size, times),
         videos.VideoTarget(to_path(video), Path(out), kind),
     )
-    extras = videos.VideoExtras(None if side is None else str(side), layer_names(depth, alpha))
+    extras = videos.VideoExtras(None if side is None else str(side), layer_names(depth, normals, alpha))
     return videos.make_video(Path(model), to_path(scene), target, request, extras, downscale=downscale, device=device)
 
 

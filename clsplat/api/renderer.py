@@ -24,6 +24,7 @@ from clsplat.render.painter import Layers, render_layers
 from clsplat.render.rasterizer import Content, Frame, Rasterizer, pose_gradient
 from clsplat.render.tiles import Sort
 from clsplat.scene.view import View, to_color
+from clsplat.viewer.video.frames import depth_normals
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
@@ -78,6 +79,7 @@ class RenderResult:
     image: Floats  # [height, width, 3], over the background
     alpha: Floats  # [height, width] in [0, 1], opacity of each pixel
     depth: Floats | None  # [height, width] scene units, mean depth of each pixel; 0 where alpha is 0
+    median_depth: Floats | None  # [height, width] scene units, where transmittance falls below ½; 0: nowhere
     view: View
     background: Floats  # [3]
     model: DeviceModel  # the rendered model, which stays on the device as long as this result
@@ -101,6 +103,15 @@ class RenderResult:
     def __repr__(self) -> str:
         height, width = self.alpha.shape
         return f"RenderResult({width} x {height} px of '{self.view.name}')"
+
+    def normals(self) -> Floats:
+        """Return unit normals from the mean depth, [height, width, 3], in scene axes; 0 where they are unknown.
+
+        Raises ValueError for a view that was rendered without depth.
+        """
+        if self.depth is None:
+            raise ValueError("normals: expected a view rendered with depth=True")
+        return depth_normals(self.depth, self.view)
 
     def png(self) -> bytes:
         """Return the image as an 8-bit PNG file."""
@@ -148,7 +159,7 @@ class Renderer:
         """Render a view.  A moving model is rendered at the time of the view.
 
         background: a color in [0, 1], as one number or three; default: the model's sky or background, or black
-        depth: also render the depth, which requires a second pass
+        depth: also render the mean and the median depth, which requires a second pass
 
         Raises ValueError for an invalid camera or background, and NumericError if a value of the result is not finite.
         """
@@ -158,7 +169,8 @@ class Renderer:
         layers = render_layers(self.rasterizer, model, camera, self.device.upload(color), depth)
         for values in layers.arrays:
             require_finite(values, view)
-        return RenderResult(layers.image, layers.alpha, layers.depth, view, color, model, self)
+        depths = layers.depth, layers.median_depth
+        return RenderResult(layers.image, layers.alpha, *depths, view, color, model, self)
 
     def render_batch(
         self, views: Sequence[View], background: Color | None = None, depth: bool = False

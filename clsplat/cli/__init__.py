@@ -16,7 +16,7 @@ from clsplat.core.signals import stop_at_once, stopping_on_signals
 
 COMPLETION = "_CLSPLAT_COMPLETE"  # set where a shell asks for completions
 DEBUG, PLUGIN = "--debug", "--plugin"  # options that may come before or after the command
-LIVE = "--live"  # its port is optional
+OPTIONAL_VALUES = {"--live": ("0", str.isdecimal), "--depth": ("mean", ("mean", "median").__contains__)}  # default
 
 
 def main(*leading: str) -> None:
@@ -25,7 +25,7 @@ def main(*leading: str) -> None:
     leading: arguments to insert before those of the process.
     """
     signals.install()
-    arguments = _move_options_first(_expand_live(_expand_set([*leading, *sys.argv[1:]])))
+    arguments = _move_options_first(_expand_optional(_expand_set([*leading, *sys.argv[1:]])))
     try:
         with stopping_on_signals(stop_at_once):
             exit_code = app(arguments, prog_name="clsplat", standalone_mode=False)
@@ -84,13 +84,13 @@ def _expand_set(arguments: list[str]) -> list[str]:
     return result
 
 
-def _expand_live(arguments: list[str]) -> list[str]:
-    """Expand `--live` without a number to `--live=0`."""
-    next_args = [*arguments, ""][1:]
-    return [
-        f"{LIVE}=0" if argument == LIVE and not next_arg.isdecimal() else argument
-        for argument, next_arg in zip(arguments, next_args, strict=True)
-    ]
+def _expand_optional(arguments: list[str]) -> list[str]:
+    """Add the default to options whose value is optional: expand `--live` without a number to `--live=0`."""
+    expanded = []
+    for argument, next_argument in zip(arguments, [*arguments, ""][1:], strict=True):
+        default, is_value = OPTIONAL_VALUES.get(argument, ("", bool))
+        expanded.append(f"{argument}={default}" if default and not is_value(next_argument) else argument)
+    return expanded
 
 
 def _move_options_first(arguments: list[str]) -> list[str]:

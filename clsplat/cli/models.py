@@ -283,6 +283,12 @@ SizeOption = Annotated[
     str | None,
     typer.Option(metavar="WxH", help="Video: size of a frame in pixels, even numbers; default: that of the photos."),
 ]
+DepthOption = Annotated[
+    Literal["mean", "median"] | None,
+    typer.Option(
+        "--depth", metavar="[mean|median]", help="Also write depths, as NAME_depth or NAME_median_depth; red is near."
+    ),
+]
 TimeOption = Annotated[
     float | None, typer.Option(metavar="T", help="Dynamic model: time, 0 to 1; default: the time of each view.")
 ]
@@ -295,6 +301,7 @@ TimesOption = Annotated[
     "render",
     "clsplat render runs/splat_7k --out images",
     "clsplat render point_cloud.ply --scene my_scene --split all --format npy",
+    "clsplat render runs/splat_7k --depth median --normals",
     "clsplat render runs/splat_7k --video ellipse.webm --size 1280x720",
     "clsplat render runs/a --path views --side photograph --video both.webm",
     "clsplat render runs/dynamic --path fixed --times 0..1 --video motion.webm",
@@ -306,7 +313,8 @@ def render(
     scale: ScaleOption = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the images.")] = Path("renders"),
     format_: FormatOption = "png",
-    depth: Annotated[bool, typer.Option("--depth", help="Also write depths, as NAME_depth; red is near.")] = False,
+    depth: DepthOption = None,
+    normals: Annotated[bool, typer.Option("--normals", help="Also write normals, as NAME_normals.")] = False,
     alpha: Annotated[bool, typer.Option("--alpha", help="Also write opacities, as NAME_alpha.")] = False,
     path: PathOption = None,
     frames: Annotated[int | None, typer.Option(metavar="N", help="Video: number of frames; default: 120.")] = None,
@@ -328,7 +336,7 @@ def render(
             raise ConfigError("--split is for images of views; for a video of all views, use --path views")
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
         options["times"] = times if time is None else time
-        options |= {"depth": depth, "alpha": alpha, "downscale": scale, "kind": format_}
+        options |= {"depth": depth or False, "normals": normals, "alpha": alpha, "downscale": scale, "kind": format_}
         result = pictures.render_path(model, scene, file, out=out, device=device, **options)
         terminal.print_message(_video_text(result, columns=1 if side is None else 2))
         return
@@ -342,7 +350,8 @@ def render(
         split=split or "test",
         downscale=scale,
         kind=format_,
-        depth=depth,
+        depth=depth or False,
+        normals=normals,
         alpha=alpha,
         time=time,
         device=device,

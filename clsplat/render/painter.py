@@ -17,26 +17,29 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Layers:
-    """A rendered view on the host: color, alpha, and depth."""
+    """A rendered view on the host: color, alpha, and depths."""
 
     image: Floats  # [height, width, 3], with background
     alpha: Floats  # [height, width] in [0, 1]
     depth: Floats | None  # [height, width] scene units, alpha-weighted mean; 0 where alpha is 0
+    median_depth: Floats | None = None  # [height, width] scene units, where transmittance falls below ½; 0: nowhere
+    normals: Floats | None = None  # [height, width, 3] unit, in scene axes, from the mean depth; 0: unknown
 
     @property
     def arrays(self) -> list[Floats]:
         """All rendered layers."""
-        return [self.image, self.alpha, *([] if self.depth is None else [self.depth])]
+        layers = self.image, self.alpha, self.depth, self.median_depth, self.normals
+        return [layer for layer in layers if layer is not None]
 
 
 def render_layers(
     rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera, background: Array, depth: bool = False
 ) -> Layers:
-    """Render a view to the host.  background: [3]; depth: whether to render the depth too, in a second pass."""
+    """Render a view to the host.  background: [3]; depth: whether to render both depths too, in a second pass."""
     frame = rasterizer.forward(model, camera, background)
     image = crop(frame, frame.image.get())
     alpha = crop(frame, 1 - np.abs(frame.transmittance.get()[None]))[:, :, 0]
-    return Layers(image, alpha, _depth(rasterizer, model, camera) if depth else None)
+    return Layers(image, alpha, *(_depths(rasterizer, model, camera) if depth else (None, None)))
 
 
 def crop(frame: Frame, planes: Floats) -> Floats:
@@ -44,12 +47,14 @@ def crop(frame: Frame, planes: Floats) -> Floats:
     return np.ascontiguousarray(planes[:, : frame.camera.height, : frame.camera.width].transpose(1, 2, 0))
 
 
-def _depth(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera) -> Floats:
+def _depths(rasterizer: Rasterizer, model: DeviceModel, camera: DeviceCamera) -> tuple[Floats, Floats]:
+    """Return the mean and the median depth."""
     black = rasterizer.device.upload(np.zeros(3, np.float32))
     frame = rasterizer.forward(model, camera, black, "depth")
     planes = crop(frame, frame.image.get())
     weight = planes[:, :, 1]
-    return np.divide(planes[:, :, 0], weight, out=np.zeros_like(weight), where=weight > 0)
+    mean_depth = np.divide(planes[:, :, 0], weight, out=np.zeros_like(weight), where=weight > 0)
+    return mean_depth, np.ascontiguousarray(planes[:, :, 2])
 
 
 class Painter(Protocol):

@@ -148,8 +148,9 @@ PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 POSE_SUMS, POSE_GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 MAX_PAIRS = 2**31  # sums of pairs have 32 bits
 Content = Literal["color", "depth", "inverse_depth"]
-# color: three planes of color.  depth: the depth of the mean in scene units, 1, and 0.  inverse_depth: the color, and a
-# fourth plane with the blended inverse depth of the means.
+# color: three planes of color.  depth: the blended depth of the means, alpha, and the median depth (0: none), in scene
+# units.  inverse_depth: the color, and a fourth plane with the blended inverse depth of the means.
+DEFINES = {"inverse_depth": {"INVERSE_DEPTH": 1}, "depth": {"MEDIAN_DEPTH": 1}}
 
 
 @dataclass(frozen=True)
@@ -271,9 +272,8 @@ class Rasterizer:
         return Frame(camera, *buffers, image, transmittance, bands, content, model)
 
     def _blend(self, content: Content, **defines: int) -> Program:
-        """Return the blending kernels, which have a fourth plane only if the content needs it."""
-        defines |= {"INVERSE_DEPTH": 1} if content == "inverse_depth" else {}
-        return self.device.program(f"blend_{self.device.schedule}.cl", **defines)
+        """Return the blending kernels for this content."""
+        return self.device.program(f"blend_{self.device.schedule}.cl", **defines, **DEFINES.get(content, {}))
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
         rows = np.linspace(0, camera.tiles_y, min(self._bands.get(camera.tiles_y, 1), camera.tiles_y) + 1).astype(int)

@@ -44,7 +44,7 @@ from clsplat.stages.export import Export
 from clsplat.stages.render import image_paths
 from clsplat.stages.train_field import ExportField
 from clsplat.training.modules.base import apply_side_files, read_color_model
-from clsplat.viewer.video.frames import LAYERS, Canvas, layer_image, layer_values
+from clsplat.viewer.video.frames import DEPTH_LAYERS, LAYERS, Canvas, layer_image, layer_values
 from clsplat.viewer.video.plan import parse_times, require_motion
 
 # Models on the host: Gaussians, or a field.
@@ -257,14 +257,15 @@ def write_pictures(
     files = [{layer: _layer_path(path, layer) for layer in layers} for path in color_paths]
     paths = [path for layer_files in files for path in layer_files.values()]
     if len(set(paths)) < len(paths):
-        raise ConfigError(f"{out}: two images would have the same name; rename the view that ends in _depth or _alpha")
+        raise ConfigError(f"{out}: two images would have the same name; rename the view that ends in _{layers[-1]}")
     _check_folder(out, paths, photographs)
     names = [path.relative_to(out).as_posix() for path in paths]
     record = {**_read_record(out), **dict.fromkeys(names, is_video)}
     _write_record(out, record)
-    depths = canvas.depth_range(views) if "depth" in layers and kind == "png" else (0.0, 0.0)
+    has_range = kind == "png" and not DEPTH_LAYERS.isdisjoint(layers)
+    depths = canvas.depth_range(views) if has_range else (0.0, 0.0)
     for view, layer_files in counted(zip(views, files, strict=True), "views rendered", len(views)):
-        buffers = canvas.render_layers(view, "depth" in layers)
+        buffers = canvas.render_layers(view, layers)
         for layer, path in layer_files.items():
             if kind == "png":
                 write_image(path, layer_image(buffers, layer, depths))

@@ -41,6 +41,8 @@ def test_depth_of_a_single_gaussian_is_its_own(device, rng):
     assert (picture.alpha > 0).any()
     np.testing.assert_allclose(picture.depth[picture.alpha > 0], depth, rtol=1e-5)
     np.testing.assert_array_equal(picture.depth[picture.alpha == 0], 0)
+    np.testing.assert_allclose(picture.median_depth[picture.alpha > 0.51], depth, rtol=1e-5)
+    np.testing.assert_array_equal(picture.median_depth[picture.alpha < 0.49], 0)
 
 
 @on_one_setting

@@ -207,6 +207,8 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
         "p->inverse_depth += k.weight * color",
         "p->inverse_depth += p->t * color",
     ),
+    "blend_forward wide, median depths": ("splat.h", "(p->t >= 0.5f)", "(p->t >= 0.4f)"),
+    "blend_forward simt, median depths": ("splat.h", "(k.next < 0.5f)", "(k.next < 0.6f)"),
     "blend_backward wide, inverse depth": ("blend_wide.cl", "+ p.inverse_depth * VLOAD", "- p.inverse_depth * VLOAD"),
     "blend_backward simt, inverse depth": (
         "blend_simt.cl",

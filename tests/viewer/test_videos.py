@@ -9,8 +9,10 @@ import pytest
 
 import clsplat
 from clsplat.core.errors import ConfigError, DataError, NumericError
+from clsplat.scene.camera import Camera
 from clsplat.scene.images import read_image
-from clsplat.viewer.video.frames import Canvas, depth_image, letterbox
+from clsplat.scene.view import NO_FILE, View
+from clsplat.viewer.video.frames import Canvas, depth_image, depth_normals, letterbox
 from clsplat.viewer.video.plan import VideoRequest, plan_video
 from tests.support.camera_paths import write_camera_path
 from tests.support.commands import clsplat as command
@@ -170,6 +172,34 @@ def test_depth_and_coverage_are_images_and_arrays(few_steps, tmp_path):
     assert 1 < seen.min() < seen.max() < 8
     gray = read_image(tmp_path / "png" / "test" / "r_000_alpha.png")
     np.testing.assert_allclose(gray[:, :, 1] / 255, alpha, atol=0.5 / 255)
+
+
+def test_median_depth_and_normals_are_images_and_arrays(few_steps, tmp_path):
+    clsplat.render_views(few_steps, out=tmp_path / "png", depth="median", normals=True)
+    command("render", few_steps, "--depth", "median", "--normals", "--format", "npy", "--out", tmp_path / "npy")
+    files = [tmp_path / "npy" / "test" / f"r_000_{name}.npy" for name in ("median_depth", "normals")]
+    median_depth, normals = map(np.load, files)
+    image = read_image(tmp_path / "png" / "test" / "r_000_normals.png")
+    is_known = (normals != 0).any(axis=2)
+    assert is_known.any()
+    np.testing.assert_allclose(np.linalg.norm(normals[is_known], axis=1), 1, rtol=1e-5)
+    np.testing.assert_allclose(image[is_known], (normals[is_known] + 1) / 2 * 255, atol=1)
+    assert median_depth[is_known].max() > 1
+
+
+def test_normals_of_a_plane_are_exact_in_scene_axes():
+    """The plane z = 4 + x / 2 in the axes of a camera that is turned by 90 degrees; beside it, nothing."""
+    camera = Camera(20, 10, 15.0, 15.0, 10.0, 5.0)
+    x = (np.arange(20) + 0.5 - 10) / 15
+    depth = np.tile(4 / (1 - x / 2), (10, 1)).astype(np.float32)
+    depth[:, 15:] = 0
+    turned = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 2]], np.float32)
+    normals = depth_normals(depth, View("a", camera, turned, NO_FILE))
+    is_inside = np.zeros((10, 20), bool)
+    is_inside[1:-1, 1:14] = True
+    np.testing.assert_array_equal((normals != 0).any(axis=2), is_inside)
+    expected = np.array([0.5, 0, -1]) / np.hypot(1, 0.5) @ turned[:, :3]
+    np.testing.assert_allclose(normals[is_inside], np.tile(expected, (is_inside.sum(), 1)), atol=1e-5)
 
 
 def test_depth_colors_range_from_red_to_blue():

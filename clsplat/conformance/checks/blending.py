@@ -8,7 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, GRADIENT, SUM, Checks, Results, check_image, compare, compare_max, match
+from clsplat.conformance.check import (
+    CONIC,
+    DEPTH,
+    GRADIENT,
+    SUM,
+    Checks,
+    Results,
+    check_image,
+    compare,
+    compare_max,
+    count_true,
+    match,
+)
 from clsplat.conformance.checks.images import SIZES, blank_image, make_camera, make_comparison, to_planes
 from clsplat.conformance.scenes import Case, random_case, safe_case, sums_to_gradients
 from clsplat.density.statistics import ABS_X
@@ -272,6 +284,20 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Results:
         yield match("blend_forward", f"colors, {label}", image[:3], color_frame.image.get()[:, :height, :width])
         for actual, by_bands in zip(sums, differentiate(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
             yield match("sum_inverse_depths", f"against bands of tiles, {label}", by_bands, actual)
+
+
+@CHECKS.add("blend_forward")
+def median_depths(device: Device, rng: np.random.Generator) -> Results:
+    for count, width, height in ((0, 16, 16), (1, 16, 16), (17, 33, 15), (120, 24, 24)):
+        case = safe_case(rng, count, width, height, MARGIN, _make_opaque)
+        label = f"{count} Gaussians, {width} x {height} px"
+        rasterizer, camera = Rasterizer(device, "radix"), case.device_camera(device)
+        image = rasterizer.forward(case.model(device), camera, device.zeros(3), "depth").image.get()
+        expected, gap = ref.median_depth(case.project(), width, height)
+        is_safe = gap > MARGIN
+        yield count_true("blend_forward", f"median depths near a step, {label}", ~is_safe, allowed=0.02 * is_safe.size)
+        actual = image[2, :height, :width]
+        yield compare_max("blend_forward", f"median depths, {label}", actual[is_safe], expected[is_safe], DEPTH)
 
 
 @CHECKS.add("inverse_depth_loss")

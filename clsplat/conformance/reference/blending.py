@@ -307,6 +307,16 @@ def inverse_depth(splats: Splats, width: int, height: int, thresholds: Threshold
     return np.asarray(image[0])
 
 
+def median_depth(splats: Splats, width: int, height: int) -> tuple[Floats, Floats]:
+    """Return the depth of the splat that takes the transmittance T below ½, or 0, and the least |T - ½|, both [H,W]."""
+    depth, gap = np.zeros((height, width)), np.full((height, width), 0.5)
+    for step in blend_steps(splats, width, height, Thresholds()):
+        after = step.before * np.where(step.blended, 1 - step.alpha, 1)
+        depth = np.where((step.before >= 0.5) & (after < 0.5), splats.depth[step.splat], depth)
+        gap = np.minimum(gap, np.abs(after - 0.5))
+    return depth, gap
+
+
 def inverse_depth_backward(
     splats: Splats, width: int, height: int, grad: Floats, thresholds: Thresholds = Thresholds()
 ) -> tuple[SplatGradients, Floats]:

@@ -1,12 +1,13 @@
 """Render the layers of views, and convert them to 8-bit images."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.errors import ConfigError
 from clsplat.metrics.images import to_8_bits
 from clsplat.metrics.views import require_finite
 from clsplat.render.camera import upload_camera
@@ -14,12 +15,14 @@ from clsplat.render.painter import Layers, Painter
 from clsplat.scene.view import View
 
 Image = NDArray[np.uint8]
-LAYERS = ("color", "depth", "alpha")
+LAYERS = ("color", "depth", "median_depth", "normals", "alpha")
+DEPTH_LAYERS = frozenset(LAYERS[1:4])  # need depths
 PROBES = 8  # views whose depths determine the range of colors
 PROBE_SIDE = 240  # px
 OPAQUE = 0.5  # alpha above which the depth of a pixel counts
 QUANTILES = 0.02, 0.98  # of the depths, for near and far
 MIN_RANGE = 1e-3  # relative to far
+MAX_STEP = 0.05  # between the depths of neighbors, relative: normals are unknown at larger steps
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,15 @@ class Canvas:
 
     painter: Painter
 
-    def render_layers(self, view: View, depth: bool = False) -> Layers:
-        """Render the color, alpha, and optionally depth of a view.  Raises NumericError if they are not finite."""
-        layers = self.painter.render_layers(upload_camera(self.painter.workspace.device, view), depth)
+    def render_layers(self, view: View, names: Collection[str] = LAYERS[:1]) -> Layers:
+        """Render the color, alpha, and the named layers of a view.  Raises NumericError if they are not finite."""
+        has_depth = not DEPTH_LAYERS.isdisjoint(names)
+        layers = self.painter.render_layers(upload_camera(self.painter.workspace.device, view), has_depth)
         for values in layers.arrays:
             require_finite(values, view)
+        if "normals" in names:
+            assert layers.depth is not None
+            return replace(layers, normals=depth_normals(layers.depth, view))
         return layers
 
     def picture(self, view: View) -> Image:
@@ -45,7 +52,7 @@ class Canvas:
         for i in np.unique(np.linspace(0, len(views) - 1, min(PROBES, len(views))).round().astype(int)):
             view, long_side = views[i], max(views[i].camera.width, views[i].camera.height)
             small_view = replace(view, camera=view.camera.downscaled(max(1, long_side / PROBE_SIDE)))
-            layers = self.render_layers(small_view, depth=True)
+            layers = self.render_layers(small_view, DEPTH_LAYERS)
             assert layers.depth is not None
             depths.append(layers.depth[layers.alpha > OPAQUE])
         all_depths = np.concatenate(depths)
@@ -61,15 +68,42 @@ def layer_image(layers: Layers, layer: str, depths: tuple[float, float]) -> Imag
         return to_8_bits(layers.image)
     if layer == "alpha":
         return np.repeat(to_8_bits(layers.alpha)[:, :, None], 3, axis=2)
-    assert layers.depth is not None
-    return depth_image(layers.depth, layers.alpha, depths)
+    values = layer_values(layers, layer)
+    if layer == "normals":
+        return to_8_bits(((values + 1) / 2 * (values != 0).any(axis=2, keepdims=True)).astype(np.float32))
+    return depth_image(values, layers.alpha, depths)
 
 
 def layer_values(layers: Layers, layer: str) -> NDArray[np.float32]:
-    """Return a layer, named in LAYERS, as floats, [height, width] or [height, width, 3]."""
-    array = {"color": layers.image, "depth": layers.depth, "alpha": layers.alpha}[layer]
-    assert array is not None
+    """Return a layer, named in LAYERS, as floats, [height, width] or [height, width, 3].
+
+    Raises ConfigError for the median depth of a field.
+    """
+    array = {"color": layers.image}.get(layer, getattr(layers, layer, None))
+    if array is None:
+        raise ConfigError(f"--depth median: a field has no {layer.replace('_', ' ')}; use --depth mean")
     return array
+
+
+def depth_normals(depth: NDArray[np.float32], view: View) -> NDArray[np.float32]:
+    """Return the unit normals of a depth image, in the axes of the scene, toward the camera, [height, width, 3].
+
+    They are from the differences between the pixels above and below, left and right; 0 where one of them has no depth
+    or one that differs by more than MAX_STEP.
+    """
+    camera, (height, width) = view.camera, depth.shape
+    x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
+    y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
+    z = np.pad(depth.astype(np.float64), 1)
+    points = np.stack([z[1:-1, 1:-1] * x, z[1:-1, 1:-1] * y[:, None], z[1:-1, 1:-1]], axis=2)
+    is_known = depth > 0
+    for neighbor in (z[1:-1, :-2], z[1:-1, 2:], z[:-2, 1:-1], z[2:, 1:-1]):
+        is_known = is_known & (np.abs(neighbor - depth) <= MAX_STEP * depth)
+    padded = np.pad(points, ((1, 1), (1, 1), (0, 0)))
+    normals = np.cross(padded[2:, 1:-1] - padded[:-2, 1:-1], padded[1:-1, 2:] - padded[1:-1, :-2])
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    unit = np.divide(normals, length, out=np.zeros_like(normals), where=is_known[:, :, None] & (length > 0))
+    return np.asarray(unit @ view.world_to_camera[:, :3], np.float32)
 
 
 def depth_image(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:

@@ -13,7 +13,7 @@ from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.view_selection import ViewSelection
 from clsplat.viewer.video import camera_path, encoding
-from clsplat.viewer.video.frames import LAYERS, Canvas, Image, layer_image, side_by_side
+from clsplat.viewer.video.frames import DEPTH_LAYERS, LAYERS, Canvas, Image, layer_image, side_by_side
 from clsplat.viewer.video.paths import (
     PATHS,
     Floats,
@@ -189,7 +189,7 @@ def render_video(
     """Render the views to videos, one per layer.  side: returns the image to the right of the color layer."""
     full_width = plan.size[0] * (1 if side is None else 2)
     check_size((full_width, plan.size[1]))
-    depths = canvas.depth_range(plan.views) if "depth" in videos else (0.0, 0.0)
+    depths = (0.0, 0.0) if DEPTH_LAYERS.isdisjoint(videos) else canvas.depth_range(plan.views)
     with ExitStack() as stack:
         writers = {
             layer: stack.enter_context(
@@ -198,7 +198,7 @@ def render_video(
             for layer, path in videos.items()
         }
         for view in progress(plan.views):
-            layers = canvas.render_layers(view, "depth" in videos)
+            layers = canvas.render_layers(view, videos)
             for layer, write in writers.items():
                 image = layer_image(layers, layer, depths)
                 write(side_by_side(image, side(view)) if side and layer == LAYERS[0] else image)
