@@ -110,7 +110,7 @@ def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, 
     size: width and height of the images, px.  initial: the initial number of Gaussians.  units: as for `step_seconds`.
     """
     pixels = size[0] * size[1]
-    maximum = max(initial, int(max_gaussians(training, pixels) or MAX_PER_PIXEL * pixels))
+    maximum = max(initial, int(max_gaussians(training) or MAX_PER_PIXEL * pixels))
     low, high = step_seconds(units, size, initial)[0], step_seconds(units, size, maximum)[1]
     steps = training.min_steps, training.steps * (2 if training.refit else 1)
     steps_text, counts_text = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (initial, maximum)))
@@ -128,14 +128,11 @@ def _field_estimate(training: TrainField, units: int) -> Estimate:
     return Estimate(training.stage, (training.steps * low, training.steps * SLOWER * low), reason)
 
 
-def max_gaussians(training: Optimize, pixels: int) -> float | None:
-    """Return the maximum number of Gaussians that the settings of a training allow; None if there is no limit.
-
-    pixels: number of pixels of an image.
-    """
+def max_gaussians(training: Optimize) -> float | None:
+    """Return the maximum number of Gaussians that the settings of a training allow; None if there is no limit."""
     growth_stages = [stage for stage in training.during if isinstance(stage, Densify)]
     limits = [max(schedule_values(stage.max_gaussians)) for stage in growth_stages if stage.max_gaussians is not None]
-    return min([*limits, *(stage.per_pixel * pixels for stage in growth_stages if stage.per_pixel)], default=None)
+    return min(limits, default=None)
 
 
 def step_seconds(units: int, size: tuple[int, int], count: int) -> tuple[float, float]:

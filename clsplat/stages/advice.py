@@ -1,7 +1,6 @@
 """Find the limits of a run's result from its views, records and cameras, and suggest a command for each limit."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,20 +44,16 @@ def advice(run: Run, is_overfit: bool) -> list[str]:
         line["view"]: line["psnr"] for line in lines if line["split"] == "test" and line["step"] == run.model_step
     }
     rerun, resume = f"clsplat run {shell_quote(run.out / PIPELINE)}", f"clsplat resume {shell_quote(run.out)}"
-    stages = run.pipeline["stages"]
     can_mask = run.learned_field is None and not any(module_class(name).masks_objects for name in run.modules)
     has_exposures = color_model(run) is not None or run.learned_field is not None
-    limits = [edit["limit"] for edit in run.records.read("densify") if "limit" in edit]
-    key = find_limit(stages)
-    growth = (limits[-1], f"{rerun} --set {key}=null") if limits and key else None
     train_longer = f"{resume} --steps {2 * run.step}"
     sentences = [
         *advise_on_training_views(metrics, has_exposures, rerun, run.step if can_mask else None),
-        *advise_on_fit(metrics, is_overfit, growth, rerun, train_longer),
+        *advise_on_fit(metrics, is_overfit, rerun, train_longer),
         *advise_on_test_views(test_psnr, rerun),
         *advise_on_capture(views, run.original.views, rerun),
     ]
-    if (reason := sky_reason(run)) and any("export" in entry for entry in stages):
+    if (reason := sky_reason(run)) and any("export" in entry for entry in run.pipeline["stages"]):
         choice, effect = ("sidecar", "leaves it out") if sky_gaussians(run) else ("splats", "adds it")
         state = "has it as distant Gaussians" if sky_gaussians(run) else "does not show it in other viewers"
         text = f"a sky was added, since {reason}; the model file {state}: `{resume} --set export.sky={choice}` {effect}"
@@ -90,36 +85,16 @@ def advise_on_training_views(
         )
 
 
-def advise_on_fit(
-    metrics: Sequence[ViewMetrics], is_overfit: bool, growth: tuple[int, str] | None, rerun: str, train_longer: str
-) -> Iterator[str]:
-    """Yield advice if the model overfits, if its growth was limited, or if it fits the photos poorly, in this order.
+def advise_on_fit(metrics: Sequence[ViewMetrics], is_overfit: bool, rerun: str, train_longer: str) -> Iterator[str]:
+    """Yield advice if the model overfits, or else if it fits the photos poorly.
 
-    growth: the limit that stopped growth, and the command that trains without it.  rerun: the command that repeats the
-    run.  train_longer: the command that trains longer.
+    rerun: the command that repeats the run.  train_longer: the command that trains longer.
     """
     train_psnr = float(np.mean([view.psnr for view in metrics])) if metrics else np.inf
     if is_overfit:
         yield f"the model overfits: add photos between the existing ones, then `{rerun}`"
-    elif growth:
-        limit, command = growth
-        yield f"growth stopped at its limit of {limit:,} Gaussians, {train_psnr:.1f} dB at training views: `{command}`"
     elif train_psnr < LOW_PSNR:
         yield f"the model underfits: only {train_psnr:.1f} dB at training views; train longer: `{train_longer}`"
-
-
-def find_limit(stages: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the key for `--set` of the first limit of Gaussians per pixel in a pipeline.  None without a limit."""
-    entries = ((name, i, entry) for group in stages for name, stage in group.items() for i, entry in _inner(stage))
-    return next((f"{name}.during.{i}.per_pixel" for name, i, entry in entries if _has_limit(entry)), None)
-
-
-def _inner(stage: Mapping[str, Any]) -> Iterator[tuple[int, Mapping[str, Any]]]:
-    yield from enumerate(stage.get("during") or ())
-
-
-def _has_limit(entry: Mapping[str, Any]) -> bool:
-    return (entry.get("densify") or {}).get("per_pixel") is not None
 
 
 def advise_on_test_views(psnr: Mapping[str, float], rerun: str) -> Iterator[str]:

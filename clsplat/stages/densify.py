@@ -7,7 +7,6 @@ from dataclasses import asdict
 from functools import partial
 from typing import Annotated, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from clsplat.core.errors import NumericError, pluralize
@@ -31,7 +30,7 @@ class Densify(Scheduled):
     stage: Literal["densify"] = "densify"
     needs: ClassVar[frozenset[str]] = frozenset({"model", "stats"})
     edits: ClassVar[bool] = True
-    training_keys: ClassVar[frozenset[str]] = frozenset({"max_gaussians", "per_pixel", "patience", "grow_until"})
+    training_keys: ClassVar[frozenset[str]] = frozenset({"max_gaussians", "patience", "grow_until"})
     step_keys: ClassVar[frozenset[str]] = frozenset({"grow_until"})
 
     rules: list[OneOf[Rule]]
@@ -39,9 +38,6 @@ class Densify(Scheduled):
     max_gaussians: AtLeastOne | None = None
     """Number of Gaussians at which growth stops; pruning continues.  Default: as many as fit in memory.  With `inside`,
     only Gaussians in the box count."""
-    per_pixel: Annotated[float, Field(gt=0)] | None = None
-    """Number of Gaussians per pixel of a training image (of median size) at which growth stops; pruning continues.
-    Default: no limit.  With `inside`, only Gaussians in the box count."""
     budget: OneOf[Budget] | None = None
     """Limit of the growth of each edit, which depends on the progress of training; needs `stop`."""
 
@@ -81,14 +77,6 @@ class Densify(Scheduled):
             raise ValueError("'budget' needs 'stop', the step at which the budget is reached")
         return self
 
-    @model_validator(mode="after")
-    def _require_growth_rule(self) -> "Densify":
-        if self.per_pixel is not None and not any(rule.grows for rule in self.rules):
-            raise ValueError(
-                "'per_pixel' limits growth, and no rule here grows; set it to null, or add a rule that clones or splits"
-            )
-        return self
-
     def stale(self, run: Run) -> Collection[str]:
         return run.model.gaussians.trained
 
@@ -107,8 +95,7 @@ class Densify(Scheduled):
             remedy = f"smaller photos{offload_advice(run)} leave room for more"
             limit_text = f"{capacity:,} Gaussians, the most that fit in the device's memory; {remedy}"
             LOG.warning("step %d: growth stops at %s", run.step, limit_text)
-        is_limited = self.per_pixel is not None and 0 < limit <= change.after
-        run.records.add(run.step, "densify", **asdict(change), **({"limit": limit} if is_limited else {}))
+        run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", pluralize(change.after, "Gaussian"))
         if change.after == 0:
             raise NumericError(f"step {run.step}: all Gaussians were pruned; weaken the prune rules or lower the rates")
@@ -140,10 +127,6 @@ class Densify(Scheduled):
             yield 0
         if self.max_gaussians is not None:
             yield int(edit.at(self.max_gaussians)) + self._count_outside(run, edit)
-        if self.per_pixel is not None:
-            views = [view for view in run.scene.split("train") if view.downscale == run.downscale]
-            sizes = [view.camera.width * view.camera.height for view in views]
-            yield max(1, int(self.per_pixel * float(np.median(sizes)))) + self._count_outside(run, edit)
         if self.budget and self.every and self.stop:
             edits = len(fire_steps(self.every, run.step - 1, self.stop))
             context = BudgetContext(run.step / self.stop, edits, run.image_downscale)

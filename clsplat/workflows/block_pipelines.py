@@ -41,10 +41,6 @@ def require_divisible(pipeline: Pipeline) -> None:
             any(getattr(stage.budget, "gaussians", None) for stage in _densify_stages(pipeline.stages)),
             "it limits the whole scene; use densify.max_gaussians, which is split between blocks",
         ),
-        "densify.per_pixel": (
-            any(stage.per_pixel for stage in _densify_stages(pipeline.stages)),
-            "blocks have different photos; use densify.max_gaussians, which is split between blocks",
-        ),
         "densify.inside": (
             any(stage.inside for stage in _densify_stages(pipeline.stages)),
             "each block sets it; leave it out",

@@ -80,9 +80,7 @@ def block_seconds(
 def _gaussian_range(block: Block, pipeline: Pipeline, size: tuple[int, int]) -> tuple[int, int]:
     """Return the initial and maximum numbers of Gaussians of a block.  Without a limit, the maximum is a guess."""
     initial_count, pixels = int(block.start.sum()), size[0] * size[1]
-    limits = [
-        max_gaussians(stage, pixels) or block.pairs * MAX_PER_PIXEL * pixels for stage in _optimize_stages(pipeline)
-    ]
+    limits = [max_gaussians(stage) or block.pairs * MAX_PER_PIXEL * pixels for stage in _optimize_stages(pipeline)]
     return initial_count, max(initial_count, int(max(limits)) + initial_count - block.gaussians)
 
 

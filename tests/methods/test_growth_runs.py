@@ -86,15 +86,3 @@ def test_mcmc_does_not_depend_on_the_unit_of_length(tiny_scene, tmp_path):
         results.append(json.loads((run.out / "metrics.json").read_text())["test"]["1"]["psnr"])
     assert results[0] > 13
     assert results[1] == pytest.approx(results[0], abs=0.02)
-
-
-def test_growth_stops_at_a_number_of_gaussians_per_pixel(tiny_scene, tmp_path):
-    """Of a photograph of 40 x 40 px: at 160, where growth alone would go on."""
-    grown = []
-    for limit in ("null", "0.1"):
-        settings = "optimize.steps=12", "init.count=100", f"densify.per_pixel={limit}", "densify.every=2"
-        rules = "densify.start=2", "densify.rules=[{type: clone, gradient_above: 1.0e-9, size_below: 9}]"
-        out = train(tiny_scene, tmp_path / limit, *settings, *rules, "init.source=random").out
-        grown.append(json.loads((out / "metrics.json").read_text())["gaussians"])
-    assert grown[0] > 160
-    assert grown[1] == 160

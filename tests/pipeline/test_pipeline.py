@@ -115,7 +115,7 @@ MATCHING = {
     for key in ("", ".start", ".statistic", ".as_many_as", ".gradient_above", ".opacity", *size)
 }
 SUBDIVIDE = (".start", ".max_fraction", ".beta", ".children", ".radius_above")
-STAGE = ("budget", "every", "grow_until", "inside", "max_gaussians", "patience", "per_pixel", "start", "stop")
+STAGE = ("budget", "every", "grow_until", "inside", "max_gaussians", "patience", "start", "stop")
 THINNING = {
     *(f"densify~{n}.{key}" for n in (2, 3) for key in STAGE),
     *(f"densify~2.rules.prune_unimportant{key}" for key in ("", ".start", ".share")),

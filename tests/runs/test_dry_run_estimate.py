@@ -47,7 +47,7 @@ def test_time_estimates_scale_with_the_work(photos):
     7,000 steps and as many again."""
     steps = ", ".join(f"{{stage: {name}}}" for name in ("find_features", "match_features", "map_cameras", "undistort"))
     refit = "scene.validation=auto", "optimize.keep=best", "optimize.patience=4", "optimize.refit=true"
-    lines = expected("splat_7k", photos, f"prepare=[{steps}]", *refit, "densify.per_pixel=2")
+    lines = expected("splat_7k", photos, f"prepare=[{steps}]", *refit, "densify.max_gaussians=9600")
     assert [line.split()[0] for line in lines] == [
         "expected:", "find_features", "match_features", "map_cameras", "undistort", "optimize",
     ]  # fmt: skip
@@ -57,11 +57,11 @@ def test_time_estimates_scale_with_the_work(photos):
     assert lines[-1].split()[1:4] == ["0.1", "to", "4.4"]
 
 
-def test_estimated_growth_follows_the_limit_per_pixel(photos):
+def test_estimated_growth_follows_the_limit(photos):
     for path in photos.iterdir():
         cv2.imwrite(str(path), np.zeros((120, 160, 3), np.uint8))
-    lines = expected("photos", photos, "optimize.during.1.per_pixel=0.6")
-    assert "with 5,000 to 11,520 Gaussians at 160x120 px" in lines[-1], "0.6 for each pixel"
+    lines = expected("photos", photos, "optimize.during.1.max_gaussians=11520")
+    assert "with 5,000 to 11,520 Gaussians at 160x120 px" in lines[-1]
     assert "11,520" not in expected("photos", photos)[-1]
 
 

@@ -18,7 +18,6 @@ from clsplat.stages.advice import (
     advise_on_fit,
     advise_on_test_views,
     advise_on_training_views,
-    find_limit,
     find_outliers,
     find_widest_gap,
 )
@@ -89,26 +88,18 @@ def test_added_sky_is_reported_with_its_reason():
 
 
 @pytest.mark.parametrize(
-    ("psnr", "is_overfit", "growth", "start"),
+    ("psnr", "is_overfit", "start"),
     [
-        (30.0, True, (600, "less"), "the model overfits"),
-        (30.0, False, (600, "less"), "growth stopped at its limit of 600 Gaussians, 30.0 dB"),
-        (LOW_PSNR - 1, False, None, "the model underfits: only 23.0 dB"),
-        (LOW_PSNR, False, None, ""),
+        (LOW_PSNR - 1, True, "the model overfits"),
+        (LOW_PSNR - 1, False, "the model underfits: only 23.0 dB"),
+        (LOW_PSNR, False, ""),
     ],
 )
-def test_what_limited_the_fit_is_named_once(psnr, is_overfit, growth, start):
-    texts = [*advise_on_fit(measured([psnr - 1, psnr + 1]), is_overfit, growth, "again", "longer")]
+def test_what_limited_the_fit_is_named_once(psnr, is_overfit, start):
+    texts = [*advise_on_fit(measured([psnr - 1, psnr + 1]), is_overfit, "again", "longer")]
     assert len(texts) == bool(start)
-    command = "again" if is_overfit else "less" if growth else "longer"
+    command = "again" if is_overfit else "longer"
     assert all(text.startswith(start) and text.endswith(f"`{command}`") for text in texts)
-
-
-def test_setting_that_limits_growth_is_named_as_in_set():
-    limited = load("photos", ["optimize.during.1.per_pixel=0.1"])
-    key = find_limit(limited.resolved()["stages"])
-    assert key == "optimize.during.1.per_pixel"
-    load("photos", [f"{key}=null"])
 
 
 def test_few_images_are_reported():

@@ -283,7 +283,6 @@ def test_coarse_model_is_trained_if_none_is_given(tiny_scene, tmp_path):
             "densify.budget={type: parabola, gaussians: 900}",
             "densify.budget cannot be used with blocks: it limits the whole",
         ),
-        ("densify.per_pixel=0.1", "densify.per_pixel cannot be used with blocks: blocks have different photos"),
         ("init.source=random", "expected `init: {source: model}` first, and an 'optimize' stage"),
     ],
 )

@@ -202,8 +202,8 @@ def _settings(run: RunFolder) -> dict[str, str]:
 def _is_below(key_path: str, key: str) -> bool:
     """Return whether a flat key path is equal to, or below, a key in the notation of `--set`.
 
-    `--set` numbers the stages, and flat paths contain their names: `optimize.during.0.per_pixel` is equal to
-    `optimize.densify.per_pixel`.
+    `--set` numbers the stages, and flat paths contain their names: `optimize.during.0.max_gaussians` is equal to
+    `optimize.densify.max_gaussians`.
     """
     names = iter(key_path.split("."))
     return all(name in names for name in key.split(".") if name != "during" and not name.isdigit())
