@@ -12,7 +12,7 @@ class BudgetContext:
     """The progress of training at an edit."""
 
     progress: float  # fraction of the steps up to the last edit that have been run, 0 to 1
-    edits: int  # remaining edits, including this one
+    remaining_edits: int  # including this one
     divisor: float  # downscale factor of the photographs
 
 
@@ -25,8 +25,8 @@ class Budget(Settings):
         return set()
 
     @abstractmethod
-    def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
+    def limit(self, edit: Edit, context: BudgetContext, state: dict[str, float]) -> int:
         """Return the largest number of Gaussians after the edit.
 
-        numbers: values by name that the budget may change; they persist between edits and in checkpoints.
+        state: values by name, which the budget may change; they persist between edits and are in checkpoints.
         """

@@ -36,20 +36,20 @@ def require_rows(copies: int, old_rows: int) -> None:
 
 
 def encode_outcomes(
-    chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], old_rows: int, count: int
+    mask: NDArray[np.bool_], copies: int | NDArray[np.integer], old_rows: int, count: int
 ) -> NDArray[np.uint32]:
-    """Return copies + 1 for the Gaussians of the mask `chosen`, and 0 for the others, [N].
+    """Return copies + 1 for the Gaussians in the mask, and 0 for the others, [N].
 
     count: the number of Gaussians, N.  Raises ValueError like `Edit.choose`.
     """
     copies = np.asarray(copies)
-    if chosen.dtype != np.bool_ or chosen.shape != (count,):
-        raise ValueError(f"chosen: expected a mask, bool [{count}], got {chosen.dtype} {list(chosen.shape)}")
+    if mask.dtype != np.bool_ or mask.shape != (count,):
+        raise ValueError(f"mask: expected bool [{count}], got {mask.dtype} {list(mask.shape)}")
     if not np.issubdtype(copies.dtype, np.integer) or copies.shape not in ((), (count,)):
         raise ValueError(f"copies: expected an integer or integers [{count}], got {copies.dtype} {list(copies.shape)}")
     require_rows(int(copies.min(initial=0)), old_rows)
     require_rows(int(copies.max(initial=0)), old_rows)
-    return np.where(chosen, copies.astype(np.int64) + 1, 0).astype(np.uint32)
+    return np.where(mask, copies.astype(np.int64) + 1, 0).astype(np.uint32)
 
 
 MAX_BOUND = 3.0e38  # an upper bound of all values
@@ -59,8 +59,8 @@ MIN_BOUND = 1.2e-38  # the smallest normal float, a lower bound of all positive 
 class Edit:
     """An edit of the Gaussians: the outcome of each.
 
-    An outcome consists of the number of rows that replace the Gaussian, the number of these that are its old row, the
-    factor on the scales of fresh rows, and whether the rows share its opacity.
+    An outcome consists of the number of rows that replace the Gaussian, the number of these that keep its moments and
+    statistics, the factor on the scales of fresh rows, and whether the rows share its opacity.
 
     Random numbers depend only on `seed`, `step`, and the rule.
     """
@@ -129,8 +129,8 @@ class Edit:
             items=gaussians.count,
             log_scales=gaussians["log_scales"],
             logit_opacity=gaussians["logit_opacity"],
-            statistic=self.stats.total(statistic) if statistic else self.stats.seen,
-            divisor=self.stats.divisor(statistic) if statistic else self.stats.seen,
+            statistic=self.stats.total(statistic) if statistic else self.stats.view_count,
+            divisor=self.stats.divisor(statistic) if statistic else self.stats.view_count,
             **self._outcome,
             gradient_above=gradient_above / self.stats.factor(statistic) if statistic else gradient_above,
             size_above=size_above * self.scene_scale.extent,
@@ -145,7 +145,7 @@ class Edit:
         )
 
     def matching_threshold(self, statistic: str, other: str, gradient_above: float) -> float:
-        """Return the threshold that as many Gaussians reach in `statistic` as reach `gradient_above` in `other`."""
+        """Return the threshold of `statistic` that as many Gaussians reach as reach `gradient_above` in `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
         fraction = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
@@ -161,18 +161,18 @@ class Edit:
         return max(float(np.quantile(mean, threshold.quantile)), MIN_BOUND) if len(mean) else MIN_BOUND
 
     def choose(
-        self, chosen: NDArray[np.bool_], copies: int | NDArray[np.integer], old_rows: int, shrink: float = 1.0
+        self, mask: NDArray[np.bool_], copies: int | NDArray[np.integer], old_rows: int, shrink: float = 1.0
     ) -> None:
-        """Set the outcome of the Gaussians of a mask, `chosen`, [N].
+        """Set the outcome of the Gaussians in a mask, [N].
 
-        copies: number of rows that replace each Gaussian, a scalar or [N].  old_rows: number of these that are the old
-        row, with its moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.
+        copies: number of rows that replace each Gaussian, a scalar or [N].  old_rows: number of these that keep the
+        Gaussian's moments and statistics; the others are fresh.  shrink: factor on the scales of fresh rows.
         Raises ValueError for a wrong shape or type, and for a number of rows below 0 or above MAX_ROWS.
         """
         count = self.gaussians.count
         self._program.mark_chosen(
             items=count,
-            outcome=self.gaussians.device.upload(encode_outcomes(chosen, copies, old_rows, count)),
+            outcome=self.gaussians.device.upload(encode_outcomes(mask, copies, old_rows, count)),
             copies=self.copies,
             old_rows=self.old_rows,
             shrink=self.shrink,

@@ -1,4 +1,4 @@
-"""Score how much Gaussians contribute to images, and select the highest scores or sample by score."""
+"""Score the contributions of Gaussians to images, and select Gaussians with high scores or sample them by score."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
@@ -15,7 +15,7 @@ from clsplat.density.thresholds import Share
 from clsplat.formats.splats import inverse_opacities
 
 Score = Literal["weight", "sensitivity"]
-Scoring = Callable[[Iterable[RenderedView], int], NDArray[np.float32]]
+ScoreFunction = Callable[[Iterable[RenderedView], int], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -31,24 +31,24 @@ def weights(
 ) -> Weights:
     """Return the weights of N = `count` Gaussians, added in the order of the views.
 
-    weight_per_view: fraction of a view's total weight that its heaviest Gaussians contribute; these are useful in the
-    view.  None: do not count views.  dtype: type of the total.
+    weight_per_view: the Gaussians with the largest weights that make up this fraction of a view's weight are useful in
+    the view; None: do not count views.  dtype: type of the total.
     """
     total, useful_views = np.zeros(count, dtype), np.zeros(count, np.int64)
     for view in views:
         weight = view.sum(WEIGHT)
         total += weight
         if weight_per_view is not None:
-            useful_views += heaviest(weight.astype(np.float64), weight_per_view)
+            useful_views += select_by_weight(weight.astype(np.float64), weight_per_view)
     return Weights(total, useful_views)
 
 
-def heaviest(weight: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
+def select_by_weight(weight: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
     """Return the mask, [N], of the smallest set of Gaussians with `fraction` of the total weight, all above 0."""
     order = np.argsort(-weight, kind="stable")
-    heavier_sum = np.cumsum(weight[order]) - weight[order]  # the sum of all larger weights
+    preceding_sum = np.cumsum(weight[order]) - weight[order]  # of all larger weights
     mask = np.zeros(len(weight), bool)
-    mask[order] = (heavier_sum < fraction * weight.sum()) & (weight[order] > 0)
+    mask[order] = (preceding_sum < fraction * weight.sum()) & (weight[order] > 0)
     return mask
 
 
@@ -69,25 +69,25 @@ def sensitivities(views: Iterable[RenderedView], count: int) -> NDArray[np.float
     return total
 
 
-SCORES: dict[Score, Scoring] = {"weight": contributions, "sensitivity": sensitivities}
+SCORES: dict[Score, ScoreFunction] = {"weight": contributions, "sensitivity": sensitivities}
 
 
 Mask = NDArray[np.bool_]
 
 
-def sampling_order(candidates: Mask, odds: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.intp]:
+def sampling_order(candidates: Mask, weights: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.intp]:
     """Return the indices of the candidates in the order of weighted sampling without replacement.
 
-    candidates: mask, [N].  odds: [N], 0 to infinity.  The largest ln(U) / odds comes first (Efraimidis and Spirakis
-    2006).
+    candidates: mask, [N].  weights: [N], 0 to infinity.  The largest ln(U) / weight comes first (Efraimidis and
+    Spirakis 2006).
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        keys = np.log1p(-random.random(len(odds))) / odds
+        keys = np.log1p(-random.random(len(weights))) / weights
     indices = np.flatnonzero(candidates)
     return indices[np.argsort(-keys[indices], kind="stable")]
 
 
-def largest(score: NDArray[np.floating], limit: int, candidates: Mask | None = None) -> Mask:
+def select_largest(score: NDArray[np.floating], limit: int, candidates: Mask | None = None) -> Mask:
     """Return the mask, [N], of the `limit` candidates with the largest scores; ties go to the lower index.
 
     candidates: mask, [N]; None for all.

@@ -1,4 +1,4 @@
-"""Merge pairs of Gaussians so that the mean and covariance of their mixture, mean color, and mass are preserved."""
+"""Merge pairs of Gaussians, preserving the mean, covariance, mean color, and mass of their mixture."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -40,13 +40,13 @@ class Mixtures:
     """The moments of mixtures of two Gaussians, weighted by mass."""
 
     mass: Floats  # [pairs] of both Gaussians together
-    fraction: Floats  # [pairs, 1] of the mass that the second Gaussian has
+    fraction: Floats  # [pairs, 1] mass of the second Gaussian, divided by the mass of both
     means: Floats  # [pairs, 3] scene units
     covariance: Floats  # [pairs, 3, 3] scene units²
 
     @classmethod
     def from_pairs(cls, tables: dict[str, Floats], mass: Floats, first: Rows, second: Rows) -> "Mixtures":
-        """Compute the mixtures of rows `first` and `second`, [pairs] each.  mass: of all rows, [N]; see `masses`."""
+        """Compute the mixtures of rows `first` and `second`, [pairs] each.  mass: [N] of all rows; see `masses`."""
         total = mass[first] + mass[second]
         fraction = (mass[second] / total)[:, None]
         means = (1 - fraction) * tables["means"][first] + fraction * tables["means"][second]

@@ -40,7 +40,7 @@ class Statistic(Settings):
     is_total: ClassVar[bool] = False  # whether to multiply the mean by the number of training views
 
     @abstractmethod
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         """Add the values of a view to `total`, [components, capacity].  grad_mean2d: [2, capacity] px⁻¹."""
 
 
@@ -52,9 +52,9 @@ class ScreenGrad(Statistic):
 
     type: Literal["screen_grad"] = "screen_grad"
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_norm(
-            **_arguments(gaussians, view.frame), planes=grad_mean2d, first=0, total=total
+            **_arguments(gaussians, gradients.frame), planes=grad_mean2d, first=0, total=total
         )
 
 
@@ -64,9 +64,9 @@ class ScreenGradAbs(Statistic):
     type: Literal["screen_grad_abs"] = "screen_grad_abs"
     pixel_sums = ABS_X + 2
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_norm(
-            **_arguments(gaussians, view.frame), planes=view.pixel_sums, first=ABS_X, total=total
+            **_arguments(gaussians, gradients.frame), planes=gradients.pixel_sums, first=ABS_X, total=total
         )
 
 
@@ -76,9 +76,9 @@ class ScreenGradAbsSum(Statistic):
     type: Literal["screen_grad_abs_sum"] = "screen_grad_abs_sum"
     pixel_sums = ABS_X + 2
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_sum(
-            **_arguments(gaussians, view.frame), planes=view.pixel_sums, first=ABS_X, total=total
+            **_arguments(gaussians, gradients.frame), planes=gradients.pixel_sums, first=ABS_X, total=total
         )
 
 
@@ -92,8 +92,8 @@ class Texture(Statistic):
     pixel_sums = TEXTURE + 1
     divisor = "blend_weight"
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
-        _add_pixel_sum(gaussians, view, TEXTURE, total)
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+        _add_pixel_sum(gaussians, gradients, TEXTURE, total)
 
 
 class ScreenRadius(Statistic):
@@ -101,9 +101,9 @@ class ScreenRadius(Statistic):
 
     type: Literal["screen_radius"] = "screen_radius"
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_radius(
-            items=gaussians.count, radius=view.frame.radius, total=total, count=gaussians.count
+            items=gaussians.count, radius=gradients.frame.radius, total=total, count=gaussians.count
         )
 
 
@@ -113,11 +113,11 @@ class BlendWeight(Statistic):
     type: Literal["blend_weight"] = "blend_weight"
     pixel_sums = TEXTURE + 1
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
-        _add_pixel_sum(gaussians, view, WEIGHT, total)
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+        _add_pixel_sum(gaussians, gradients, WEIGHT, total)
 
 
-StatisticName = Annotated[str, VariantName(Statistic, lambda kind: kind.components == 1)]
+StatisticName = Annotated[str, VariantName(Statistic, lambda cls: cls.components == 1)]
 
 
 class SplatStats:
@@ -164,18 +164,18 @@ class SplatStats:
         return self.training_views if self.columns[name].is_total else 1
 
     @property
-    def seen(self) -> Array:
+    def view_count(self) -> Array:
         """The number of views in which each Gaussian is visible, [S]."""
         return self.gaussians[SEEN]
 
-    def add(self, view: ViewGradients, grad_mean2d: Array) -> None:
+    def add(self, gradients: ViewGradients, grad_mean2d: Array) -> None:
         """Add a view to all statistics.  grad_mean2d: [2, S] px⁻¹."""
         gaussians = self.gaussians
         gaussians.device.program("density.cl").count_seen(
-            items=gaussians.count, radius=view.frame.radius, seen=self.seen, count=gaussians.count
+            items=gaussians.count, radius=gradients.frame.radius, seen=self.view_count, count=gaussians.count
         )
         for name, column in self.columns.items():
-            column.add(gaussians, view, grad_mean2d, self.total(name))
+            column.add(gaussians, gradients, grad_mean2d, self.total(name))
 
     def mean(self, name: str) -> NDArray[np.float32]:
         """Return the mean of a scalar statistic, on the host, [N]; 0 where the divisor is 0."""
@@ -193,11 +193,11 @@ class SplatStats:
                 self.gaussians[name].fill(0)
 
 
-def _add_pixel_sum(gaussians: Gaussians, view: ViewGradients, pixel_sum: int, total: Array) -> None:
+def _add_pixel_sum(gaussians: Gaussians, gradients: ViewGradients, pixel_sum: int, total: Array) -> None:
     gaussians.device.program("density.cl").accumulate_pixel_sum(
         items=gaussians.count,
-        pixel_sums=view.pixel_sums,
-        radius=view.frame.radius,
+        pixel_sums=gradients.pixel_sums,
+        radius=gradients.frame.radius,
         total=total,
         pixel_sum=pixel_sum,
         stride=gaussians.capacity,

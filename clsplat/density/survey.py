@@ -72,11 +72,11 @@ class RenderedView:
         """Return the radius of each splat, three standard deviations, [N] px; 0 if it is not visible."""
         return np.asarray(self.frame.radius.get()[: self.model.gaussians.count])
 
-    def sum(self, number: int, plane: NDArray[Any] | None = None, channel: int | None = None) -> Floats:
-        """Return a sum over pixels (`SUM_*` in cl_kernels/splat.h) for each Gaussian, [N]; 0 if it is not visible.
+    def sum(self, index: int, plane: NDArray[Any] | None = None, channel: int | None = None) -> Floats:
+        """Return a sum over pixels for each Gaussian, [N]; 0 if it is not visible.
 
-        plane: the texture, [height, width], 0 or more; None for 0.  channel: index of the image channel whose sum over
-        the image is the differentiated loss; None for no loss.
+        index: `SUM_*` in cl_kernels/splat.h.  plane: the texture, [height, width], 0 or more; None for 0.  channel:
+        index of the image channel whose sum over the image is the loss to differentiate; None for no loss.
         """
         camera, counted_mask = self.photograph.camera, self.counted_pixels()
         texture = np.full((camera.rows, camera.stride), -1, np.float32)  # -1: the pixel does not count
@@ -88,8 +88,8 @@ class RenderedView:
             gradient.fill(0)
         else:
             gradient.set((texture >= 0) * (np.arange(3) == channel)[:, None, None])
-        sums = self.rasterizer.pixel_sums(self.model, self.frame, gradient, _count_sums(number), texture_array)
-        return np.asarray(sums.get()[number, : self.model.gaussians.count])
+        sums = self.rasterizer.pixel_sums(self.model, self.frame, gradient, _sum_count(index), texture_array)
+        return np.asarray(sums.get()[index, : self.model.gaussians.count])
 
     @property
     def _workspace(self) -> Any:
@@ -100,9 +100,9 @@ class RenderedView:
         return self.rasterizer.workspace.array("grad_image", (3, camera.rows, camera.stride))
 
 
-def _count_sums(number: int) -> int:
-    """Return the number of sums that the backward pass must compute to include sum `number`."""
-    return SQUARE + 1 if number >= BLENDED else BLENDED
+def _sum_count(index: int) -> int:
+    """Return the number of sums that the backward pass must compute to include sum `index`."""
+    return SQUARE + 1 if index >= BLENDED else BLENDED
 
 
 class Survey:

@@ -36,14 +36,14 @@ class Comparison:
     depths: KnownDepths | None = None  # at pixels of the photograph, if a loss reads them
 
     @property
-    def values(self) -> int:
+    def value_count(self) -> int:
         """The number of values in the image."""
         return 3 * self.camera.width * self.camera.height
 
     @property
-    def counted(self) -> int:
+    def unmasked_value_count(self) -> int:
         """The number of values in unmasked pixels; waits for the device if there is a mask."""
-        return self.values if self.mask is None else 3 * int(self.mask.get().sum())
+        return self.value_count if self.mask is None else 3 * int(self.mask.get().sum())
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from clsplat.render.rasterizer import Content
 
 
 class InverseDepth(ImageLoss):
-    """Mean over a photograph's points of q |D - 1/z|, times the scene's extent, where z is the depth of a point and D =
-    Σ w / z the blended inverse depth of its pixel.
+    """Mean over a photograph's points of q |D - 1/z|, times the scene's extent, where z is the depth of a point and D
+    the blended inverse depth of its pixel, the sum of weight / depth over splats.
 
     q is 1 for points in at least four photographs, less for others, and 0 in photographs with a reprojection error of a
     pixel or more at training size, if the dataset has such errors.  The background does not add to D, so splats also
     become opaque at points.  We use a weight of 0.02 that falls to 0 over the first half of the steps.  The loss needs
-    points with tracks, as in COLMAP models, and does not optimize poses.
+    points with tracks, as in COLMAP models.  It has no effect on the optimization of poses.
     """
 
     type: Literal["inverse_depth"] = "inverse_depth"

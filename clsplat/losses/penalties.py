@@ -15,8 +15,8 @@ from clsplat.render.filters import AT_REST
 class CovarianceTrace(Penalty):
     """Mean over Gaussians of max(tr Σ - τ, 0), in extents² (Micro-splatting, Lee et al. 2025).
 
-    τ is `above`, or with `pixels`, 3 s², where s is the length of that number of pixels in the training view that was
-    nearest at the last edit.
+    τ is `above`, or with `pixels`, 3 s², where s is the length of `pixels` pixels in the training view that was nearest
+    at the last edit.
     """
 
     type: Literal["covariance_trace"] = "covariance_trace"
@@ -37,7 +37,9 @@ class CovarianceTrace(Penalty):
         weight = at_step(self.weight, inputs.step) / max(1, gaussians.count) / inputs.extent**2
         gaussians.device.program("penalty.cl").covariance_trace(
             **inputs.arguments("log_scales"),
-            nearest2=gaussians[INTERVAL2] if self.pixels else gaussians["filter_variance"],  # or unused: times 0
+            nearest2=gaussians[INTERVAL2]
+            if self.pixels
+            else gaussians["filter_variance"],  # without `pixels`, the kernel multiplies it by 0
             sums=sums,
             above=0.0 if self.pixels else self.above * inputs.extent**2,
             pixels2=3.0 * (self.pixels or 0.0) ** 2,

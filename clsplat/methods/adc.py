@@ -13,8 +13,8 @@ from clsplat.density.statistics import Statistic, StatisticName
 class Grow(Rule):
     """Base class of rules that turn a Gaussian into several if the mean of a statistic is large.
 
-    `as_many_as` names another statistic that sets the number of selected Gaussians: those with the largest `statistic`
-    are selected, as many as reach `gradient_above` in the other one (Gaussian Opacity Fields, Yu et al. 2024).
+    With `as_many_as`, the number of Gaussians that grow is the number that reach `gradient_above` in that statistic;
+    the largest values of `statistic` are selected (Gaussian Opacity Fields, Yu et al. 2024).
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"gradient_above", "opacity"})

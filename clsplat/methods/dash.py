@@ -44,14 +44,16 @@ class Momentum(Budget):
     def statistics(self) -> set[str]:
         return {"screen_grad"}
 
-    def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
+    def limit(self, edit: Edit, context: BudgetContext, state: dict[str, float]) -> int:
         count = edit.gaussians.count
-        initial = numbers.setdefault("momentum/start", count)
-        momentum = numbers.setdefault("momentum/sum", self.initial_momentum * initial)
+        initial = state.setdefault("momentum/start", count)
+        momentum = state.setdefault("momentum/sum", self.initial_momentum * initial)
         final = self.gaussians or initial + momentum
         target = (
-            final if context.edits == 1 else initial + (final - initial) / context.divisor ** (2 - context.progress)
+            final
+            if context.remaining_edits == 1
+            else initial + (final - initial) / context.divisor ** (2 - context.progress)
         )
         candidates = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
-        numbers["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.max_added, candidates))))
+        state["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.max_added, candidates))))
         return min(max(count, int(target)), int(count * (1 + self.growth)))

@@ -86,8 +86,8 @@ class PruneRedundant(Rule):
 class ErrorGain(Statistic):
     """Error that a Gaussian can remove over all training views, in units of the mean error of a pixel.
 
-    It is the change of the loss when the Gaussian moves by one standard deviation on the screen.  The unit does not
-    depend on the exposure, size, and number of the images, nor on the weights of the losses.
+    The value is the change of the loss when the Gaussian moves by one standard deviation on the screen.  The unit does
+    not depend on the exposure, size, and number of the images, nor on the weights of the losses.
     """
 
     type: Literal["gain"] = "gain"
@@ -95,14 +95,14 @@ class ErrorGain(Statistic):
     conflicts = NEEDS_CONIC
     is_total: ClassVar[bool] = True
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_gain(
             items=gaussians.count,
             grad_mean2d=grad_mean2d,
-            splats=view.frame.splats,
-            radius=view.frame.radius,
+            splats=gradients.frame.splats,
+            radius=gradients.frame.radius,
             total=total,
-            factor=float(view.frame.camera.width * view.frame.camera.height),
+            factor=float(gradients.frame.camera.width * gradients.frame.camera.height),
             stride=gaussians.capacity,
             count=gaussians.count,
         )
@@ -113,7 +113,7 @@ class ViewError(Statistic):
 
     type: Literal["view_error"] = "view_error"
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("density.cl").accumulate_error(
-            items=gaussians.count, error=view_error(view.comparison), total=total, count=gaussians.count
+            items=gaussians.count, error=view_error(gradients.comparison), total=total, count=gaussians.count
         )

@@ -53,7 +53,7 @@ class ByWrongPixels(Rule):
 
 
 class RevertGrowth(ByWrongPixels):
-    """Undo the growth by earlier rules of Gaussians that contribute to few wrong pixels."""
+    """Undo the growth of Gaussians that contribute to few wrong pixels."""
 
     type: Literal["revert_growth"] = "revert_growth"
     training_keys: ClassVar[frozenset[str]] = frozenset({"pixels_above"})

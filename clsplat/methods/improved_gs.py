@@ -15,7 +15,7 @@ from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.schedule import Positive
 from clsplat.density.budget import Budget, BudgetContext
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.importance import largest, sampling_order
+from clsplat.density.importance import sampling_order, select_largest
 from clsplat.density.statistics import TEXTURE
 from clsplat.density.survey import RenderedView, Survey, normalize
 from clsplat.density.thresholds import Share
@@ -54,7 +54,7 @@ class SplitLongAxis(Rule):
     views: Annotated[int, Field(ge=1)] = 10
     """Number of training views of the score, sampled by seed and step; all if there are fewer."""
     distance: Positive = 1.35
-    """Offset of each child, in standard deviations of the parent along its longest axis: 0.45 of three."""
+    """Offset of each child, in standard deviations of the parent along its longest axis (published: 0.45 · 3)."""
     opacity: Annotated[float, Field(gt=0, le=1)] = 0.6
     """Opacity of each child, as a fraction of the parent's."""
     long_axis: Annotated[float, Field(gt=0, le=1)] = 0.55
@@ -105,7 +105,7 @@ class PruneLowestOpacity(Rule):
 
     def mark(self, edit: Edit) -> None:
         logits, is_remaining = edit.gaussians.get("logit_opacity")[:, 0], edit.rows() > 0
-        edit.choose(largest(-logits, int(self.share * is_remaining.sum()), is_remaining), copies=0, old_rows=0)
+        edit.choose(select_largest(-logits, int(self.share * is_remaining.sum()), is_remaining), copies=0, old_rows=0)
 
 
 class SquareRoot(Budget):
@@ -117,5 +117,5 @@ class SquareRoot(Budget):
     gaussians: Annotated[int, Field(ge=1)]
     """The number B that the last edit may reach."""
 
-    def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
+    def limit(self, edit: Edit, context: BudgetContext, state: dict[str, float]) -> int:
         return int(self.gaussians * math.sqrt(context.progress))

@@ -43,7 +43,9 @@ class Relocate(Rule):
         draws = sample_systematically(weights, max(0, int(new_rows) + int(rows[is_faint].sum())), edit.random())
         sources = np.flatnonzero(draws)
         copies = draws[sources] + 1
-        opacities, factors = divide(opacity[sources], np.minimum(copies, MAX_COPIES), edit.at(self.opacity_below))
+        opacities, factors = divide_opacity(
+            opacity[sources], np.minimum(copies, MAX_COPIES), edit.at(self.opacity_below)
+        )
         logits = np.log(opacities / (1 - opacities))[:, None]
         log_scales = log_scales[sources] + np.log(factors)[:, None]
         for number in np.unique(copies):  # set_children has no effect if a later rule or the limit undoes the growth
@@ -57,7 +59,8 @@ class Relocate(Rule):
 def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Return the number of times that systematic sampling draws each item, [N]: the expected number rounded down or up.
 
-    It places `draws` equidistant points, shifted by one random number, on the cumulative weights, in exact integers.
+    The function places `draws` equidistant points, shifted by one random number, on the cumulative weights, in exact
+    integers.
     """
     ends = np.cumsum(weights)
     total = int(ends[-1])
@@ -67,15 +70,15 @@ def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.ra
     return np.diff(np.searchsorted(points, ends, side="left"), prepend=0)
 
 
-def divide(
-    opacity: NDArray[np.float64], rows: NDArray[np.integer], lowest: float
+def divide_opacity(
+    opacity: NDArray[np.float64], rows: NDArray[np.integer], min_opacity: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the opacity of each of `rows` equal Gaussians at one mean, and the factor on their scales (eqs. 8, 9).
 
     Together they have the opacity of the original at its center and the same integral along a line.  The published code
     clips opacities after it has computed the scales; here, the scales belong to the clipped opacities.
     """
-    child_opacity = np.clip(1 - (1 - opacity) ** (1 / rows), lowest, 1 - 1e-6)
+    child_opacity = np.clip(1 - (1 - opacity) ** (1 / rows), min_opacity, 1 - 1e-6)
     orders = range(1, MAX_COPIES + 1)
     series = sum(scipy.special.comb(rows, j) * (-1.0) ** (j - 1) * child_opacity**j / np.sqrt(j) for j in orders)
     return child_opacity, opacity / series

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from clsplat.core.schedule import NonNegative, Positive, explain_schedule
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.importance import largest
+from clsplat.density.importance import select_largest
 from clsplat.density.mixture import masses, merge
 from clsplat.density.statistics import SEEN, Statistic, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
@@ -32,8 +32,8 @@ class RenderedTexture(Statistic):
 
     type: Literal["rendered_texture"] = "rendered_texture"
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
-        frame, comparison = view.frame, view.comparison
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+        frame, comparison = gradients.frame, gradients.comparison
         gaussians.device.program("texture.cl").sample_magnitude(
             items=gaussians.count,
             magnitude=unmasked_gradient(comparison.workspace, frame.camera, frame.image, comparison.mask),
@@ -71,7 +71,7 @@ class Subdivide(Rule):
         Skips Gaussians that are small on the screen or that an earlier rule has selected.
         """
         candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
-        is_split = largest(score, int(self.max_fraction * len(candidates)), candidates)
+        is_split = select_largest(score, int(self.max_fraction * len(candidates)), candidates)
         edit.choose(is_split, copies=self.children, old_rows=0, shrink=self.beta**0.5)
 
 

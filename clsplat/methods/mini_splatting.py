@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.importance import Weights, heaviest, weights
+from clsplat.density.importance import Weights, select_by_weight, weights
 from clsplat.density.survey import WEIGHT, Survey
 from clsplat.density.thresholds import Share
 from clsplat.gaussians.gaussians import HIDDEN, HIDDEN_VIEWS, hide
@@ -31,22 +31,22 @@ def sampled_weights(survey: Survey, weight_per_view: float | None = None, number
     return weights(survey.render(views), survey.count, weight_per_view)
 
 
-def find_unneeded(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
-    """Return a mask of the Gaussians that each view sees but does not need, [V, N].
+def find_useless(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
+    """Return a mask, [V, N], of the Gaussians that are visible but not useful in each view.
 
-    A view needs its heaviest Gaussians, which together make up the fraction `weight_per_view` of its weight.
+    The Gaussians with the largest weights that make up `weight_per_view` of a view's weight are useful in the view.
     """
-    is_unneeded = np.zeros((len(survey.views), survey.count), bool)
-    for row, render in zip(is_unneeded, survey.render(survey.views), strict=True):
-        row[:] = (render.radius() > 0) & ~heaviest(render.sum(WEIGHT).astype(np.float64), weight_per_view)
-    return is_unneeded
+    is_useless = np.zeros((len(survey.views), survey.count), bool)
+    for row, render in zip(is_useless, survey.render(survey.views), strict=True):
+        row[:] = (render.radius() > 0) & ~select_by_weight(render.sum(WEIGHT).astype(np.float64), weight_per_view)
+    return is_useless
 
 
 class PruneUseless(Rule):
     """Remove Gaussians that are useful in few training views, and the Gaussians with the smallest weights.
 
-    The weight of a Gaussian in a view is the sum of alpha T over its pixels.  The heaviest Gaussians that together make
-    up `weight_per_view` of the view's weight are useful in the view.
+    The weight of a Gaussian in a view is the sum of alpha T over its pixels.  The Gaussians with the largest weights
+    that make up `weight_per_view` of the view's weight are useful in the view.
     """
 
     type: Literal["prune_useless"] = "prune_useless"
@@ -64,7 +64,7 @@ class PruneUseless(Rule):
 
     def mark(self, edit: Edit) -> None:
         weights = edit.survey.compute_once(sampled_weights, self.weight_per_view, self.views)
-        is_needed = heaviest(weights.total, self.weight_total) & (weights.views >= self.views_below)
+        is_needed = select_by_weight(weights.total, self.weight_total) & (weights.views >= self.views_below)
         edit.choose(~is_needed, copies=0, old_rows=0)
 
 
@@ -72,8 +72,8 @@ class HideUseless(Scheduled):
     """Skip Gaussians that contribute little to a training view in the steps that train on it, to save time
     (Mini-Splatting2, Fang and Wang 2024).
 
-    The heaviest Gaussians that together make up `weight_per_view` of a view's weight, alpha T over all pixels, are
-    kept.  New Gaussians are hidden in the same views as their source.  Other renders, and all renders after the
+    The Gaussians with the largest weights that make up `weight_per_view` of a view's weight, alpha T over all pixels,
+    are kept.  New Gaussians are hidden in the same views as their source.  Other renders, and all renders after the
     training, show every Gaussian.
     """
 
@@ -90,4 +90,4 @@ class HideUseless(Scheduled):
             run.model.gaussians.add(HIDDEN, -(-len(run.scene.split("train")) // HIDDEN_VIEWS))
 
     def run(self, run: Run) -> None:
-        hide(run.model.gaussians, find_unneeded(run.survey(), self.weight_per_view))
+        hide(run.model.gaussians, find_useless(run.survey(), self.weight_per_view))

@@ -13,7 +13,7 @@ from pydantic import Field
 
 from clsplat.core.schedule import NonNegative, Positive, Schedule
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.importance import largest
+from clsplat.density.importance import select_largest
 from clsplat.density.mixture import covariance_matrices
 from clsplat.density.statistics import NEEDS_CONIC, Statistic
 from clsplat.gaussians.gaussians import Gaussians
@@ -34,13 +34,13 @@ class Splitting(Statistic):
     components = 6
     conflicts = NEEDS_CONIC
 
-    def add(self, gaussians: Gaussians, view: ViewGradients, grad_mean2d: Array, total: Array) -> None:
+    def add(self, gaussians: Gaussians, gradients: ViewGradients, grad_mean2d: Array, total: Array) -> None:
         gaussians.device.program("saddle.cl").accumulate_splitting(
             items=gaussians.count,
-            means=view.frame.model.gaussians["means"],
-            splats=view.frame.splats,
-            pixel_sums=view.pixel_sums,
-            camera=view.frame.camera.array,
+            means=gradients.frame.model.gaussians["means"],
+            splats=gradients.frame.splats,
+            pixel_sums=gradients.pixel_sums,
+            camera=gradients.frame.camera.array,
             total=total,
             stride=gaussians.capacity,
             count=gaussians.count,
@@ -83,7 +83,7 @@ class SplitSteepest(Rule):
         rows = np.flatnonzero(has_gradient & (edit.rows() == 1))
         values, axes = smallest_eigenvectors(edit.stats.means("splitting")[rows].astype(np.float64) * extent**2)
         room = len(rows) if edit.room is None else max(edit.room, 0)
-        lowest = largest(-values, room, values < edit.at(self.eigenvalue_below))
+        lowest = select_largest(-values, room, values < edit.at(self.eigenvalue_below))
         rows, axes = rows[lowest], axes[lowest]
         tables = {
             name: gaussians.get(name)[rows].astype(np.float64)

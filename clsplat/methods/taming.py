@@ -125,7 +125,7 @@ class Parabola(Budget):
     gaussians: Annotated[int, Field(ge=1)]
     """The number B that the last edit may reach."""
 
-    def limit(self, edit: Edit, context: BudgetContext, numbers: dict[str, float]) -> int:
+    def limit(self, edit: Edit, context: BudgetContext, state: dict[str, float]) -> int:
         shortfall = self.gaussians - edit.gaussians.count
-        remaining = (context.edits - 1) / context.edits
+        remaining = (context.remaining_edits - 1) / context.remaining_edits
         return self.gaussians - int(shortfall * remaining**2) if shortfall > 0 else self.gaussians

@@ -20,7 +20,7 @@ from clsplat.core.reading import read_file
 # LPIPS with a network from a local ONNX file, run by OpenCV's DNN module, without downloads or torch.
 
 InputRange = Literal["-1..1", "0..1"]
-SECONDS = 300  # enough for a slow machine to read a network of 60 MB and to run it on images of one megapixel
+TIMEOUT_S = 300  # enough for a slow machine to read a network of 60 MB and to run it on images of one megapixel
 _tested_networks: set[tuple[str, int, int]] = set()  # digest, height and width that ran without a crash
 INPUTS = ("in0", "in1")  # the arguments of lpips.LPIPS.forward
 
@@ -43,10 +43,13 @@ class Lpips:
             self._network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
         except cv2.error as error:
             raise DataError(
-                f"{path}: not an ONNX file that OpenCV {cv2.__version__} can read ({_last_line(error)})"
+                f"{path}: not an ONNX file that OpenCV {cv2.__version__} can read ({_last_line(error)}); "
+                "write one with clsplat data lpips"
             ) from error
         if (distance := self.distance(gray, gray)) != 0:
-            raise ConfigError(f"{path}: not an LPIPS network; equal images have the distance {distance:g}, expected 0")
+            raise ConfigError(
+                f"{path}: not an LPIPS network; expected the distance 0 for equal images, got {distance:g}"
+            )
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
         """Return the distance of two images, [height, width, 3].  Raises ConfigError if the network rejects them."""
@@ -71,7 +74,7 @@ class Lpips:
         """Run the network in a child process, once per size.  Raises DataError if OpenCV crashes."""
         if (self.digest, height, width) in _tested_networks:
             return
-        seconds = SECONDS * max(1.0, height * width / 1e6)
+        seconds = TIMEOUT_S * max(1.0, height * width / 1e6)
         module, size = "clsplat.metrics.perceptual", (str(height), str(width))
         if crash := run_module(module, *size, seconds=seconds, stdin=self._data).crash:
             problem = f"{crash} when it runs this network on images of {width}x{height}"
@@ -162,11 +165,11 @@ def ms_ssim_scales(image: Image) -> int:
 def ms_ssim(image: Image, photograph: Image) -> float | None:
     """Return the multi-scale structural similarity (Wang, Simoncelli and Bovik 2003), in double precision.
 
-    The result is the mean over channels of a product over scales: the mean contrast-structure factor, at the coarsest
-    scale times the luminance factor, to the power of the scale's weight.  Each scale averages 2 x 2 pixels of the
-    previous one.  Means are over pixels whose 11 x 11 Gaussian window is inside the image; negative means count as 0.
-    Images with a side below 176 px have fewer scales, whose weights are renormalized.  Returns None if the image is
-    smaller than the window.
+    The result is a product over scales, averaged over channels.  At each scale, the mean of the contrast-structure
+    factor, multiplied at the coarsest scale by the luminance factor, is raised to the scale's weight.  Each scale
+    averages 2 x 2 pixels of the previous one.  Means are over pixels whose 11 x 11 Gaussian window is inside the
+    image; negative means count as 0.  Images with a side below 176 px have fewer scales, whose weights are
+    renormalized.  Returns None if the image is smaller than the window.
     """
     scales = ms_ssim_scales(image)
     if scales == 0:
@@ -214,7 +217,7 @@ def _window_mean(image: Floats) -> Floats:
 
 
 def flip(image: Image, photograph: Image) -> float:
-    """Return the mean FLIP (Andersson et al. 2020) at 67 px per degree.  Raises ConfigError if it is not installed."""
+    """Return the mean FLIP (Andersson et al. 2020) at 67 px per degree.  Raises ConfigError without its package."""
     reference, test = (np.ascontiguousarray(pixels, np.float32) / np.float32(255) for pixels in (photograph, image))
     _, mean, _ = _flip_package().evaluate(reference, test, "LDR", applyMagma=False)
     return float(mean)
@@ -224,11 +227,11 @@ def _flip_package() -> ModuleType:
     try:
         import flip_evaluator
     except ImportError as error:
-        raise ConfigError("metric flip needs an extra package: pip install 'clsplat[metrics]'") from error
+        raise ConfigError("the metric 'flip' needs an extra package; run pip install 'clsplat[metrics]'") from error
     return flip_evaluator  # type: ignore[no-any-return]
 
 
-if __name__ == "__main__":  # a child process, which a damaged network may crash
+if __name__ == "__main__":  # run in a child process, because a damaged network may crash it
     network = cv2.dnn.readNetFromONNX(np.frombuffer(sys.stdin.buffer.read(), np.uint8))
     for name in INPUTS:
         network.setInput(np.zeros((1, 3, *map(int, sys.argv[1:])), np.float32), name)

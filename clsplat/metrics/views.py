@@ -24,7 +24,7 @@ from clsplat.scene.view import View, load_mask
 
 # Static parts of a dynamic scene: PSNR of static pixels, and flicker.
 
-STILL = 3.0  # 8-bit levels; a larger standard deviation is motion, not camera noise
+MAX_NOISE = 3.0  # 8-bit levels; a larger standard deviation is motion, not camera noise
 MAX_CAMERAS = 8  # cameras whose sums are in memory, with 48 bytes per pixel
 MIN_TIMESTAMPS = 2
 FLICKER, PHOTO_FLICKER, STATIC, STATIC_FRACTION = "flicker", "flicker_photographs", "psnr_static", "static_share"
@@ -57,7 +57,7 @@ class CameraSums:
     views: list[str] = field(default_factory=list)
     renders: ImageSums = field(default_factory=ImageSums)
     photographs: ImageSums = field(default_factory=ImageSums)
-    static_mask: Mask | None = None  # pixels that are static by the file, if any, and unmasked at all timestamps
+    static_mask: Mask | None = None  # static by the file, if there is one, and unmasked at all timestamps
     has_static_file: bool = False
 
 
@@ -66,18 +66,18 @@ class FlickerMeter:
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: all views that will be added, in any order."""
-        cameras = [group for group in group_by_camera(views) if len(distinct_times(group)) >= MIN_TIMESTAMPS]
-        self._cameras = {camera_key(group[0]): CameraSums() for group in cameras[:MAX_CAMERAS]}
+        groups = [group for group in group_by_camera(views) if len(distinct_times(group)) >= MIN_TIMESTAMPS]
+        self._cameras = {camera_key(group[0]): CameraSums() for group in groups[:MAX_CAMERAS]}
 
     @property
     def camera_count(self) -> int:
         """The number of cameras whose sums are in memory."""
         return len(self._cameras)
 
-    def add(self, view: View, rendered: Image, photograph: Image, counted: Mask | None) -> dict[str, float]:
+    def add(self, view: View, rendered: Image, photograph: Image, unmasked: Mask | None) -> dict[str, float]:
         """Add a view's 8-bit images, [H, W, 3]; return its PSNR of static pixels, if a file marks them."""
         static = static_pixels(view)
-        mask = static if counted is None else counted if static is None else static & counted
+        mask = static if unmasked is None else unmasked if static is None else static & unmasked
         if view.time is not None:
             self._gather(view, rendered, photograph, mask, static is not None)
         if static is None or mask is None or not mask.any():
@@ -103,7 +103,7 @@ class FlickerMeter:
             render, photo = camera.renders.deviation(), camera.photographs.deviation()
             static = np.ones(render.shape[:2], bool) if camera.static_mask is None else camera.static_mask
             if not camera.has_static_file:
-                static = static & (photo.max(axis=2) <= STILL)
+                static = static & (photo.max(axis=2) <= MAX_NOISE)
             if static.any():
                 values = {FLICKER: float(render[static].mean()), PHOTO_FLICKER: float(photo[static].mean())}
                 flicker |= {name: {**values, STATIC_FRACTION: float(static.mean())} for name in camera.views}
@@ -125,7 +125,7 @@ def means(views: Sequence[dict[str, float]]) -> dict[str, float]:
 
 # PSNR of a render after a color transform fitted to its photograph.
 
-NOTABLE_GAIN = 1.0  # dB; if a color transform increases PSNR by more, the log explains it
+NOTABLE_GAIN = 1.0  # dB; if color fitting increases PSNR by more, the log says why
 MIN_SLOPE = 1e-3  # smallest slope of a regression by which an image is divided
 # Usable pixels per fitted parameter: p parameters fitted to n independent errors add p / n of their variance to the
 # error elsewhere, here 1 / 64, which is 0.07 dB.
@@ -154,17 +154,18 @@ class Gains:
 
 
 def color_metrics(
-    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, model: ColorFit
+    image: NDArray[np.float32], photograph: NDArray[np.uint8], mask: Mask | None, color_model: ColorFit
 ) -> dict[str, float]:
     """Return `psnr_color` and `psnr_affine`, in dB, of a render and a photograph, [height, width, 3].
 
     mask: [height, width], True for unmasked pixels.  `psnr_color` is missing if a half of the image has too few pixels
     to fit.  NaN in the render counts as black, infinity as white or black.
     """
-    truth, finite = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
+    truth = photograph / 255.0
+    finite_image = np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     full_mask = np.ones(truth.shape[:2], bool) if mask is None else mask
-    fitted_image = fit_colors(finite, photograph, full_mask, model)
-    corrected_image = correct_by_regression(finite, truth, full_mask)
+    fitted_image = fit_colors(finite_image, photograph, full_mask, color_model)
+    corrected_image = correct_by_regression(finite_image, truth, full_mask)
     color = {} if fitted_image is None else {"psnr_color": psnr(fitted_image, photograph, full_mask)}
     return {**color, "psnr_affine": psnr(corrected_image, photograph, full_mask)}
 
@@ -183,7 +184,7 @@ def mean_color_metrics(views: Sequence[dict[str, float]]) -> dict[str, Any]:
 
 
 def fit_colors(
-    image: NDArray[np.float64], photograph: NDArray[np.uint8], mask: Mask, model: ColorFit
+    image: NDArray[np.float64], photograph: NDArray[np.uint8], mask: Mask, color_model: ColorFit
 ) -> NDArray[np.float64] | None:
     """Transform the left and right halves of an image by the color model fitted to the other half.
 
@@ -192,16 +193,16 @@ def fit_colors(
     are compared on the same views.  The fit also excludes pixels that are brighter than white in the image, if enough
     others remain.
     """
-    usable = mask & ((photograph > 0) & (photograph < 255)).all(axis=2)
+    usable_mask = mask & ((photograph > 0) & (photograph < 255)).all(axis=2)
     half_width, truth, result = image.shape[1] // 2, photograph / 255.0, image.copy()
     left, right = np.s_[:, :half_width], np.s_[:, half_width:]
-    min_pixels = PIXELS_PER_PARAMETER * model.parameters_per_channel
-    if min(np.count_nonzero(usable[half]) for half in (left, right)) < min_pixels:
+    min_pixels = PIXELS_PER_PARAMETER * color_model.parameters_per_channel
+    if min(np.count_nonzero(usable_mask[half]) for half in (left, right)) < min_pixels:
         return None
     for half, fit_half in ((left, right), (right, left)):
-        below_white = usable[fit_half] & (image[fit_half] < 1).all(axis=2)
-        fit_mask = below_white if np.count_nonzero(below_white) >= min_pixels else usable[fit_half]
-        matrix = model.fit_matrix(image[fit_half][fit_mask], truth[fit_half][fit_mask])
+        below_white = usable_mask[fit_half] & (image[fit_half] < 1).all(axis=2)
+        fit_mask = below_white if np.count_nonzero(below_white) >= min_pixels else usable_mask[fit_half]
+        matrix = color_model.fit_matrix(image[fit_half][fit_mask], truth[fit_half][fit_mask])
         result[half] = np.minimum(np.einsum("hwc,ac->hwa", image[half], matrix[:, :3]) + matrix[:, 3], 1)
     return result
 
@@ -272,8 +273,8 @@ class ViewMetrics:
     ssim: float
     perceptual: dict[str, float | None] = field(default_factory=dict)
     colors: dict[str, float] = field(default_factory=dict)  # dB, after color fitting
-    still: dict[str, float] = field(default_factory=dict)  # of static pixels, in dynamic scenes
-    moments: dict[str, float] = field(default_factory=dict)  # dB, by whether the timestamp is held out
+    static: dict[str, float] = field(default_factory=dict)  # of static pixels, in dynamic scenes
+    by_time: dict[str, float] = field(default_factory=dict)  # PSNR, dB, by whether the timestamp is held out
 
     def line(self) -> dict[str, Any]:
         """Return the metrics as a line of metrics.jsonl."""
@@ -282,8 +283,8 @@ class ViewMetrics:
             "psnr": self.psnr,
             "ssim": self.ssim,
             **self.colors,
-            **self.moments,
-            **self.still,
+            **self.by_time,
+            **self.static,
             **self.perceptual,
         }
 
@@ -305,7 +306,7 @@ def require_finite(image: NDArray[np.float32], view: View) -> None:
     if not np.isfinite(image).all():
         raise NumericError(
             f"view '{view.name}': the render is not finite, since values of the model are too large for float32; "
-            "export the model again, or train it with lower rates"
+            "export the model again, or train it with lower learning rates"
         )
 
 
@@ -327,16 +328,17 @@ def measure(
     views: Sequence[View],
     photographs: Photographs,
     perceptual: Perceptual = PSNR_AND_SSIM,
-    finite: bool = False,
+    check_finite: bool = False,
     colors: ColorFit | None = None,
     progress: Iterable[View] | None = None,
     train_views: Sequence[View] = (),
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
-    Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.  finite: raise NumericError
-    for a render that is not finite, instead of counting it as black; colors: color model for `psnr_color`;
-    progress: the views wrapped by a progress counter; train_views: the training views, for metrics by timestamp.
+    Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.  check_finite: raise
+    NumericError for a render that is not finite, instead of counting it as black.  colors: color model for
+    `psnr_color`.  progress: the views wrapped by a progress counter.  train_views: the training views, for metrics by
+    timestamp.
     """
     results, flicker_meter, empty_names = list[ViewMetrics](), FlickerMeter(views), list[str]()
     for view in views if progress is None else progress:
@@ -345,7 +347,7 @@ def measure(
             LOG.warning("%s: not evaluated, since its mask excludes every pixel; check the mask", view.name)
             continue
         floats = render_floats(painter, photograph.camera, view.response)
-        if finite:
+        if check_finite:
             require_finite(floats, view)
         render = to_8_bits(floats)
         image, mask = photograph.image(), photograph.counted_pixels()
@@ -362,13 +364,13 @@ def measure(
             empty_names.append(view.name)
     if empty_names:
         LOG.warning(
-            "almost nothing is rendered in %d of %s, such as %s; check that the model fits the cameras, and model.near",
+            "almost nothing is rendered in %d of %s, such as %s; check that model and cameras match, and model.near",
             *(len(empty_names), pluralize(len(views), "view"), quote(empty_names[0])),
         )
     flicker, psnrs = flicker_meter.flicker(), {result.view: result.psnr for result in results}
-    moments = psnr_by_time(psnrs, views, train_views)
+    by_time = psnr_by_time(psnrs, views, train_views)
     return [
-        replace(result, still={**result.still, **flicker.get(result.view, {})}, moments=moments.get(result.view, {}))
+        replace(result, static={**result.static, **flicker.get(result.view, {})}, by_time=by_time.get(result.view, {}))
         for result in results
     ]
 
@@ -381,8 +383,8 @@ def mean(results: Sequence[ViewMetrics], perceptual: Perceptual = PSNR_AND_SSIM)
         "psnr": float(np.mean([r.psnr for r in results])),
         "ssim": float(np.mean([r.ssim for r in results])),
         **mean_color_metrics([r.colors for r in results]),
-        **means([r.moments for r in results]),
-        **means([r.still for r in results]),
+        **means([r.by_time for r in results]),
+        **means([r.static for r in results]),
         **perceptual.mean([r.perceptual for r in results]),
         "views": len(results),
     }
@@ -394,7 +396,7 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 def distribution(gaussians: Gaussians) -> dict[str, list[float]]:
-    """Return the QUANTILES of size (RMS scale, scene units), anisotropy (longest by shortest axis), and opacity."""
+    """Return the QUANTILES of size (RMS scale, scene units), anisotropy (longest / shortest axis), and opacity."""
     log_scales = gaussians.get("log_scales").astype(np.float64)
     columns = {
         "size": np.sqrt(np.exp(2 * log_scales).mean(axis=1)),

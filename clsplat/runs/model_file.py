@@ -393,7 +393,7 @@ class ModelFile:
                     views = scene.split(split)
                     results = measure(
                         *(self.painter, views, photographs, perceptual),
-                        finite=True,
+                        check_finite=True,
                         colors=self.colors,
                         train_views=scene.split("train"),
                     )

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from clsplat.core.errors import EmptyRegionError
 from clsplat.density.control import Box, keep_rows
-from clsplat.density.importance import SCORES, Score, largest
+from clsplat.density.importance import SCORES, Score, select_largest
 from clsplat.density.thresholds import Share
 from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
 from clsplat.training.run import Run
@@ -88,7 +88,7 @@ class PruneLeast(Scheduled):
     def run(self, run: Run) -> None:
         gaussians, score = run.model.gaussians, score_gaussians(run, self.score)
         fraction = 1 - (self.remove or 0) if self.keep is None else self.keep
-        rows = np.flatnonzero(largest(score, max(1, round(fraction * len(score)))))
+        rows = np.flatnonzero(select_largest(score, max(1, round(fraction * len(score)))))
         change = keep_rows(gaussians, rows, self.stage)
         run.refresh_filter()
         run.records.add(run.step, "densify", **asdict(change))
@@ -130,7 +130,7 @@ class ReduceSh(Scheduled):
             return
         rest = gaussians.get("sh_rest")
         energy = compute_band_energy(rest) * score_gaussians(run)[:, None]
-        is_dropped = ~largest(energy.ravel(), energy.size - round(self.share * energy.size))
+        is_dropped = ~select_largest(energy.ravel(), energy.size - round(self.share * energy.size))
         gaussians.set("sh_rest", np.where(expand_bands(is_dropped.reshape(energy.shape)), 0, rest))
         if run.adam is not None:
             run.adam.reset_moments("sh_rest")

@@ -83,8 +83,8 @@ def test_wrong_rows_are_refused_and_change_nothing(device, rng, verb, case):
 
 
 WRONG_CHOICES = {
-    "indices": ((np.arange(3), 0, 0), r"chosen: expected a mask, bool \[150\], got int64 \[3\]"),
-    "a short mask": ((np.ones(149, bool), 0, 0), r"chosen: expected a mask, bool \[150\], got bool \[149\]"),
+    "indices": ((np.arange(3), 0, 0), r"mask: expected bool \[150\], got int64 \[3\]"),
+    "a short mask": ((np.ones(149, bool), 0, 0), r"mask: expected bool \[150\], got bool \[149\]"),
     "negative copies": ((np.ones(COUNT, bool), -1, 0), "copies: expected a row count of 0 or more, got -1"),
     "one negative number": (
         (np.ones(COUNT, bool), np.arange(COUNT) - 2, 0),

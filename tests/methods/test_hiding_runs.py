@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.formats.table import read as read_ply
 from clsplat.gaussians.gaussians import HIDDEN
-from clsplat.methods.mini_splatting import find_unneeded
+from clsplat.methods.mini_splatting import find_useless
 from clsplat.training import checkpoint
 from tests.support.runs import train
 
@@ -88,4 +88,4 @@ def test_all_gaussians_are_drawn_after_training(finished):
     run = finished
     assert HIDDEN not in run.model.gaussians.tables
     assert len(read_ply(run.out / "point_cloud.ply").parameters["means"]) == run.model.gaussians.count
-    assert find_unneeded(run.survey(), 0.6).any()
+    assert find_useless(run.survey(), 0.6).any()

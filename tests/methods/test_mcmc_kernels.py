@@ -13,7 +13,7 @@ from clsplat.density.thresholds import SceneScale
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.structs import moment_tables
-from clsplat.methods.mcmc import Relocate, add_noise, divide, sample_systematically
+from clsplat.methods.mcmc import Relocate, add_noise, divide_opacity, sample_systematically
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.training.adam import Adam
@@ -208,7 +208,7 @@ def test_positions_of_many_draws_do_not_overflow():
 @pytest.mark.parametrize(("opacity", "rows"), each_once([0.05, 0.3, 0.73, 0.95, 0.999], [1, 2, 50, 20, 5]))
 def test_coincident_rows_keep_the_center_and_the_integral(opacity, rows):
     """Equations 8 and 9: o at the center, and 1 - (1 - o' G(x / factor))^n has the integral of o G(x) over a line."""
-    (new,), (factor,) = divide(np.array([opacity]), np.array([rows]), 1e-9)
+    (new,), (factor,) = divide_opacity(np.array([opacity]), np.array([rows]), 1e-9)
     assert 1 - (1 - new) ** rows == pytest.approx(opacity, rel=1e-6)
     x = np.linspace(-40, 40, 200_001)
     together = 1 - (1 - new * np.exp(-((x / factor) ** 2) / 2)) ** rows

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
-from clsplat.density.importance import largest
+from clsplat.density.importance import select_largest
 from clsplat.density.mixture import covariance_matrices, masses, merge
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale
@@ -92,7 +92,7 @@ def test_only_the_most_textured_fraction_splits(device, rng):
 
 
 def test_ties_go_to_the_first():
-    chosen = largest(np.array([1, 9, 1, 1], np.float32), 2, np.array([True, False, True, True]))
+    chosen = select_largest(np.array([1, 9, 1, 1], np.float32), 2, np.array([True, False, True, True]))
     assert chosen.tolist() == [True, False, True, False]
 
 

@@ -10,11 +10,11 @@ from clsplat.conformance.checks.blending import MARGIN
 from clsplat.conformance.checks.density import black_photograph
 from clsplat.conformance.scenes import random_case, safe_case
 from clsplat.density.edit import Edit
-from clsplat.density.importance import Weights, heaviest
+from clsplat.density.importance import Weights, select_by_weight
 from clsplat.density.statistics import SplatStats
 from clsplat.density.survey import Survey
 from clsplat.density.thresholds import SceneScale
-from clsplat.methods.mini_splatting import PruneUseless, find_unneeded, sampled_weights
+from clsplat.methods.mini_splatting import PruneUseless, find_useless, sampled_weights
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.devices import on_devices, on_one_setting
 
@@ -64,11 +64,11 @@ def test_each_view_needs_its_heaviest_gaussians(device, rng, count, width, heigh
     source = SimpleNamespace(get=lambda view: held[view], background=device.zeros(3))
     survey = Survey(Rasterizer(device, "radix"), case.model(device), source, range(2), 0, 0)
     for share in (0.0, 0.9, 1.0):
-        found = find_unneeded(survey, share)
+        found = find_useless(survey, share)
         for here, mask in zip(found, masks, strict=True):
             splats = case.project()
             weight = ref.contribution(splats, width, height, mask)
-            expected = (splats.radius > 0) & ~heaviest(weight, share)
+            expected = (splats.radius > 0) & ~select_by_weight(weight, share)
             np.testing.assert_array_equal(here, expected)
 
 
@@ -85,7 +85,7 @@ def test_each_view_needs_its_heaviest_gaussians(device, rng, count, width, heigh
     ],
 )
 def test_heaviest_gaussians_reach_the_fraction(weight, share, expected):
-    assert heaviest(np.array(weight, float), share).tolist() == expected
+    assert select_by_weight(np.array(weight, float), share).tolist() == expected
 
 
 @on_one_setting

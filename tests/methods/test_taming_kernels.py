@@ -134,7 +134,7 @@ def test_low_scores_are_pruned_first(device, rng):
 def limit(most: int, count: int, edits: int) -> int:
     """What the budget allows to an edit of `count` Gaussians, the first of so many."""
     edit = SimpleNamespace(gaussians=SimpleNamespace(count=count))
-    return Parabola(gaussians=most).limit(edit, BudgetContext(progress=0.5, edits=edits, divisor=1.0), {})
+    return Parabola(gaussians=most).limit(edit, BudgetContext(progress=0.5, remaining_edits=edits, divisor=1.0), {})
 
 
 @pytest.mark.parametrize(("first", "most", "edits"), [(100, 1500, 28), (1000, 1001, 5), (10, 10**6, 1), (7, 8, 100)])

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.metrics.views import HELD_OUT, OTHERS, STILL, FlickerMeter, ViewMetrics, mean, means, psnr_by_time
+from clsplat.metrics.views import HELD_OUT, MAX_NOISE, OTHERS, FlickerMeter, ViewMetrics, mean, means, psnr_by_time
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
@@ -69,7 +69,7 @@ def test_static_mask_defaults_to_unchanged_pixels(rng):
     photographs[1, 0, 0] ^= 3  # noise
     views = [moment(f"{i}", i / (MOMENTS - 1)) for i in range(MOMENTS)]
     rows, figures = gathered(views, renders, photographs)
-    still = photographs.astype(np.float64).std(axis=0).max(axis=2) <= STILL
+    still = photographs.astype(np.float64).std(axis=0).max(axis=2) <= MAX_NOISE
     assert still[:, :5].all()
     assert not still[:, 5:].any()
     assert figures["0"]["flicker"] == pytest.approx(renders[:, still].astype(np.float64).std(axis=0).mean())
@@ -107,7 +107,7 @@ def test_held_out_times_are_measured_separately():
     psnr = {view.name: 20.0 + i for i, view in enumerate(views)}
     moments = psnr_by_time(psnr, views, [views[0], views[2]])
     assert moments == {"0": {OTHERS: 20.0}, "1": {HELD_OUT: 21.0}, "2": {OTHERS: 22.0}}
-    result = mean([ViewMetrics(name, value, 0.9, moments=moments[name]) for name, value in psnr.items()])
+    result = mean([ViewMetrics(name, value, 0.9, by_time=moments[name]) for name, value in psnr.items()])
     assert (result["psnr"], result[HELD_OUT], result[OTHERS]) == (21, 21, 21)
     for trained in (views, [moment("x", 0.2)], [moment("y", None)], []):
         assert not psnr_by_time(psnr, views, trained)

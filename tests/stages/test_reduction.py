@@ -9,7 +9,7 @@ import pytest
 from clsplat.conformance import reference as ref
 from clsplat.core.errors import ConfigError, Interrupted
 from clsplat.core.progress import Progress
-from clsplat.density.importance import largest, sensitivities
+from clsplat.density.importance import select_largest, sensitivities
 from clsplat.formats.packing import morton_order
 from clsplat.formats.table import read
 from clsplat.gaussians.model import Model, load
@@ -93,7 +93,7 @@ def test_image_change_can_be_the_score(tiny_scene, pipeline, tmp_path):
 
 
 def test_ties_keep_the_first_gaussians():
-    np.testing.assert_array_equal(np.flatnonzero(largest(np.array([1.0, 2, 1, 2, 1]), 3)), [0, 1, 3])
+    np.testing.assert_array_equal(np.flatnonzero(select_largest(np.array([1.0, 2, 1, 2, 1]), 3)), [0, 1, 3])
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
