@@ -37,15 +37,15 @@ if TYPE_CHECKING:
     from clsplat.api.commands import train_in_blocks as train_in_blocks
     from clsplat.api.commands import view as view
     from clsplat.api.commands import write_levels as write_levels
-    from clsplat.api.pictures import camera_path as camera_path
-    from clsplat.api.pictures import render_path as render_path
-    from clsplat.api.pictures import render_views as render_views
-    from clsplat.api.pictures import write_cameras as write_cameras
-    from clsplat.api.pictures import write_video as write_video
     from clsplat.api.renderer import FieldRenderer as FieldRenderer
     from clsplat.api.renderer import Gradients as Gradients
     from clsplat.api.renderer import Renderer as Renderer
     from clsplat.api.renderer import RenderResult as RenderResult
+    from clsplat.api.rendering import camera_path as camera_path
+    from clsplat.api.rendering import render_path as render_path
+    from clsplat.api.rendering import render_views as render_views
+    from clsplat.api.rendering import write_cameras as write_cameras
+    from clsplat.api.rendering import write_video as write_video
     from clsplat.api.tools import devices as devices
     from clsplat.api.tools import doctor as doctor
     from clsplat.api.tools import inspect_scene as inspect_scene
@@ -92,7 +92,7 @@ _EXPORTS = {  # modules that define the names; `import clsplat` does not import 
     "clsplat.api.commands": "cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
     " pipeline_schema pipelines plan_in_blocks resume run run_cell status status_schema"
     " run_worker train_in_blocks view write_levels",
-    "clsplat.api.pictures": "camera_path render_path render_views write_cameras write_video",
+    "clsplat.api.rendering": "camera_path render_path render_views write_cameras write_video",
     "clsplat.api.renderer": "FieldRenderer Gradients RenderResult Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",

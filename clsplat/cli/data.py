@@ -96,7 +96,7 @@ def cameras(
     images: Annotated[Literal["none", "copy"], typer.Option(help="Whether to copy the photos as well.")] = "none",
 ) -> None:
     """Write the cameras of a scene for other programs."""
-    from clsplat.api.pictures import write_cameras
+    from clsplat.api.rendering import write_cameras
 
     print("\n".join(str(path) for path in write_cameras(scene, out, format_, images)))
     if images == "none" and format_ != "inria":

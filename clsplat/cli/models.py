@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from clsplat.api import commands, pictures
+from clsplat.api import commands, rendering
 from clsplat.cli.app import DeviceOption, JsonOption, ModelArgument, SceneOption, command
 from clsplat.core import terminal
 from clsplat.core.errors import ConfigError, pluralize, quote
@@ -337,13 +337,13 @@ def render(
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
         options["times"] = times if time is None else time
         options |= {"depth": depth or False, "normals": normals, "alpha": alpha, "downscale": scale, "kind": format_}
-        result = pictures.render_path(model, scene, file, out=out, device=device, **options)
+        result = rendering.render_path(model, scene, file, out=out, device=device, **options)
         terminal.print_message(_video_text(result, columns=1 if side is None else 2))
         return
     video_options: dict[str, Any] = {"--frames": frames, "--fps": fps, "--size": size, "--side": side, "--times": times}
     if names := [name for name, value in video_options.items() if value is not None]:
         raise ConfigError(f"{names[0]} is for videos; add --path or --video")
-    count = pictures.render_views(
+    count = rendering.render_views(
         model,
         scene,
         out,

@@ -307,7 +307,7 @@ def _open_zstd(data: bytes) -> tuple[Any, type[Exception]]:
     try:
         import zstandard
     except ImportError as error:
-        raise ConfigError("SPZ version 4 needs Zstandard; install it: pip install 'clsplat[spz]'") from error
+        raise ConfigError("SPZ version 4 needs Zstandard; in a checkout, pip install '.[spz]'") from error
     return zstandard.ZstdDecompressor(max_window_size=1 << MAX_WINDOW).stream_reader(data), zstandard.ZstdError
 
 

@@ -227,7 +227,7 @@ def _flip_package() -> ModuleType:
     try:
         import flip_evaluator
     except ImportError as error:
-        raise ConfigError("the metric 'flip' needs an extra package; run pip install 'clsplat[metrics]'") from error
+        raise ConfigError("metric 'flip' needs an extra package; in a checkout, pip install '.[metrics]'") from error
     return flip_evaluator  # type: ignore[no-any-return]
 
 

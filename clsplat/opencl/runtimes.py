@@ -26,7 +26,7 @@ PROBE_MODULE = "clsplat.opencl.probe"
 PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
 
 INSTALL = (
-    "install a runtime: pip install 'clsplat[pocl]', pip install 'clsplat[intel]', apt install pocl-opencl-icd, or "
+    "install a runtime: pip install '.[pocl]' or pip install '.[intel]' in a checkout, apt install pocl-opencl-icd, or "
     "your GPU's driver"
 )
 VARIABLES = ("POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # any of them may hide a runtime
@@ -37,7 +37,7 @@ LOADING, LOADED = "clsplat loads the runtimes", "clsplat has listed the devices"
 _HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
 _NO_EXECUTION = "PoCL's cache is on a file system mounted with `noexec`: mount it with `exec`, or set POCL_CACHE_DIR"
 OTHER_DRIVERS = "remove this file, or set OCL_ICD_VENDORS to a folder with the .icd files of the other runtimes"
-_OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install 'clsplat[intel]'"
+_OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install '.[intel]' in a checkout"
 _ADVICE = (  # text in the output of a failed test kernel, and advice
     ("without the vectors", f"this runtime does not support the processor: {_OTHER_RUNTIMES}"),
     ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),

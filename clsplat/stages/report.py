@@ -224,7 +224,7 @@ def views(run: Run) -> dict[str, list[ViewFigure]]:
 
 def _figure(record: dict[str, Any], image: Image, photograph: Image) -> ViewFigure:
     difference = np.clip(np.abs(image.astype(np.int16) - photograph) * 4, 0, 255).astype(np.uint8)
-    images = {"render": image, "photograph": photograph, "difference": difference}
+    images = {"render": image, "photo": photograph, "difference": difference}
     caption = f"{record['view']} ({record['split']}): {record['psnr']:.2f} dB, SSIM {record['ssim']:.4f}"
     return ViewFigure(caption, {label: data_url(pixels) for label, pixels in images.items()})
 

@@ -37,7 +37,7 @@ try:
     import dask
     import distributed
 except ImportError:
-    raise ConfigError("this engine needs Dask: pip install 'clsplat[cluster]'") from None
+    raise ConfigError("this engine needs Dask: in a checkout, pip install '.[cluster]'") from None
 
 __all__ = ["LOOPBACK", "SETTINGS", "dask", "distributed", "security"]
 LOOPBACK = "127.0.0.1"

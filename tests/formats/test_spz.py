@@ -304,7 +304,7 @@ def test_version_4_without_zstandard_names_the_package(tmp_path, rng, monkeypatc
     version_4(tmp_path / "a.spz", splats(rng, 3))
     monkeypatch.setitem(sys.modules, "zstandard", None)
     monkeypatch.setitem(sys.modules, "compression", None)
-    with pytest.raises(ConfigError, match=r"pip install 'clsplat\[spz\]'"):
+    with pytest.raises(ConfigError, match=r"pip install '\.\[spz\]'"):
         read(tmp_path / "a.spz")
 
 

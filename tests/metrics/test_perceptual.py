@@ -81,7 +81,7 @@ def test_flip_matches_its_package_and_is_zero_for_equal_images(rng):
 
 def test_flip_without_its_package_is_refused_before_training(monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    with pytest.raises(ConfigError, match=r"pip install 'clsplat\[metrics\]'"):
+    with pytest.raises(ConfigError, match=r"pip install '\.\[metrics\]'"):
         Evaluate(metrics=["psnr", "ssim", "flip"]).check()
 
 

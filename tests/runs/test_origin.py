@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clsplat.api.commands import convert, evaluate, view
-from clsplat.api.pictures import render_path
+from clsplat.api.rendering import render_path
 from clsplat.core.errors import ConfigError
 from clsplat.formats.ply import MAX_HEADER, parse_ply_header
 from clsplat.gaussians.model import Model, load

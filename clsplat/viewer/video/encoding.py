@@ -148,7 +148,7 @@ def _webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
         if not writer.isOpened():
             raise OutputError(
                 f"{path.parent}: OpenCV cannot write WebM (VP8); check the folder, install OpenCV from pip, "
-                f"which includes FFmpeg, or write .mp4 with the extra clsplat[video], {ALTERNATIVE}"
+                f"which includes FFmpeg, or write .mp4 with the extra `video`, {ALTERNATIVE}"
             )
 
         def write(image: Image) -> None:
@@ -192,7 +192,7 @@ def _require_av() -> ModuleType:
         return import_module("av")
     except ImportError as error:
         raise ConfigError(
-            f"MP4 needs PyAV; install it: pip install 'clsplat[video]', or use the suffix .webm, {ALTERNATIVE}"
+            f"MP4 needs PyAV; in a checkout, pip install '.[video]', or use the suffix .webm, {ALTERNATIVE}"
         ) from error
 
 
