@@ -120,8 +120,9 @@ void emit_large(
     __global const uint *restrict tile_box,    // [S] see tiles.h
     __global const uint *restrict tile_count,  // [S]
     __global const uint *restrict first_pair,  // [N] first pair of each Gaussian
-    __global uint *restrict pair_tile,         // [P]
-    __global uint *restrict pair_splat,        // [P]
+    __global const uint *restrict pair_count,  // [1] 0 if the pairs exceed the room
+    __global uint *restrict pair_tile,         // [room]
+    __global uint *restrict pair_splat,        // [room]
     const uint tiles_x,
     const uint row_begin,                      // of the band of tiles
     const uint row_end,
@@ -130,7 +131,8 @@ void emit_large(
 {
     __local uint sums[TEAM];
     const uint item = get_local_id(0), first = get_group_id(0) * run;
-    for (uint i = first; i < first + run && i < count; i++)
+    const uint listed = pair_count[0] > 0 ? count : 0;
+    for (uint i = first; i < first + run && i < listed; i++)
         if (IS_LARGE(tile_box[i])) {
             footprint_t f;
             const rows_t part = split_rows(splats + (size_t)i * RECORD, tiles_x, row_begin, row_end, &f);

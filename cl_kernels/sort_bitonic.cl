@@ -8,31 +8,31 @@
  * end counts as +infinity and is skipped.  Local memory: SORT_CAPACITY * 8 bytes; longer tiles are sorted in place. */
 #include "common.h"
 
-/* tile_count[tile] = pairs of the tile.  One item = one pair. */
+/* tile_count[tile] = pairs of the tile.  One item = one slot for a pair. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void count_pairs(
-    __global const uint *restrict pair_tile,  // [P]
-    __global uint *restrict tile_pair_count,  // [T] starts at 0
-    const uint count)
+    __global const uint *restrict pair_tile,   // [room]
+    __global const uint *restrict pair_count,  // [1]
+    __global uint *restrict tile_pair_count)   // [T] starts at 0
 {
-    const uint pair = get_global_id(0);
+    const uint pair = get_global_id(0), count = pair_count[0];
     if (pair < count)
         atomic_inc(tile_pair_count + pair_tile[pair]);
 }
 
-/* Write each pair, with its depth, to its tile.  One item = one pair. */
+/* Write each pair, with its depth, to its tile.  One item = one slot for a pair. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void fill_tiles(
-    __global const uint *restrict pair_tile,   // [P]
-    __global const uint *restrict pair_splat,  // [P]
+    __global const uint *restrict pair_tile,   // [room]
+    __global const uint *restrict pair_splat,  // [room]
+    __global const uint *restrict pair_count,  // [1]
     __global const uint *restrict depth_key,   // [N] bits of z
     __global const uint *restrict tile_offset, // [T+1]
     __global uint *restrict tile_fill,         // [T] starts at 0
-    __global uint *restrict tile_depth,        // [P]
-    __global uint *restrict tile_pairs,        // [P]
-    const uint count)
+    __global uint *restrict tile_depth,        // [room]
+    __global uint *restrict tile_pairs)        // [room]
 {
-    const uint pair = get_global_id(0);
+    const uint pair = get_global_id(0), count = pair_count[0];
     if (pair >= count)
         return;
     const uint tile = pair_tile[pair];

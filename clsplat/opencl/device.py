@@ -111,9 +111,11 @@ class Array:
         The copy follows all work enqueued so far, and does not wait for later work.  Raises MemoryLimitError,
         DeviceError.
         """
-        host = np.empty(self.shape, self.dtype)
+        return self._copy_later(np.empty(self.shape, self.dtype))
+
+    def _copy_later(self, host: NDArray[Any], **part: Any) -> Callable[[], NDArray[Any]]:
         with self.device.raising_errors("a copy to the host"):
-            copy = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False)
+            copy = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False, **part)
 
         def wait() -> NDArray[Any]:
             with self.device.raising_errors("a copy to the host"):
@@ -124,10 +126,12 @@ class Array:
 
     def get_item(self, index: int) -> Any:
         """Copy one value of a one-dimensional array to the host.  Waits, and raises the errors of `get`."""
-        host = np.empty(1, self.dtype)
-        with self.device.raising_errors("a copy to the host"):
-            cl.enqueue_copy(self.device.queue, host, self.buffer, src_offset=index * self.dtype.itemsize)
-        return host[0]
+        return self.get_item_later(index)()
+
+    def get_item_later(self, index: int) -> Callable[[], Any]:
+        """Start to copy one value of a one-dimensional array to the host, like `get_later`."""
+        wait = self._copy_later(np.empty(1, self.dtype), src_offset=index * self.dtype.itemsize)
+        return lambda: wait()[0].item()
 
     def set(self, values: NDArray[Any]) -> None:
         """Copy values of the same shape from the host.  Raises ValueError, MemoryLimitError, DeviceError."""

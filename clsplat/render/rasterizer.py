@@ -217,8 +217,24 @@ class Rasterizer:
         """Render the model.  background: [3], used if the model has no sky.
 
         If the pairs of all tiles exceed the budget or the device's memory, the frame is rendered in bands of rows, with
-        the same bits.  Raises MemoryLimitError if a single row does not fit.
+        the same bits.  Waits for the number of pairs.  Raises MemoryLimitError if a single row does not fit.
         """
+        while not self.is_complete(frame := self.start_forward(model, camera, background, content)):
+            pass
+        return frame
+
+    def is_complete(self, frame: Frame) -> bool:
+        """Wait for the number of pairs, and return whether they fit; if not, `start_forward` must be repeated."""
+        try:
+            return self.tiler.has_room(frame.lists)
+        except TooManyPairs as error:
+            self._split_pairs(frame.camera, error)
+            return False
+
+    def start_forward(
+        self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "color"
+    ) -> Frame:
+        """Render the model like `forward` without waiting; `is_complete` returns whether the frame is valid."""
         sky = model.sky if content != "depth" else None
         model = evaluate_motion(self.workspace, model, camera)
         catch_up(self.workspace, model, camera)
@@ -229,17 +245,21 @@ class Rasterizer:
                     self.skies.paint(sky, camera, frame.image, frame.transmittance)
                 return frame
             except TooManyPairs as error:
-                if not self._halve_bands(camera):
-                    raise MemoryLimitError(
-                        f"an image of {camera.width}x{camera.height} px has a row of tiles with more than "
-                        f"{MAX_PAIRS:,} (tile, Gaussian) pairs; use smaller images, or fewer Gaussians"
-                    ) from error
+                self._split_pairs(camera, error)
             except MemoryLimitError:
                 if not self._halve_bands(camera):
                     raise
 
+    def _split_pairs(self, camera: DeviceCamera, error: TooManyPairs) -> None:
+        if not self._halve_bands(camera):
+            raise MemoryLimitError(
+                f"an image of {camera.width}x{camera.height} px has a row of tiles with more than "
+                f"{MAX_PAIRS:,} (tile, Gaussian) pairs; use smaller images, or fewer Gaussians"
+            ) from error
+
     def _halve_bands(self, camera: DeviceCamera) -> bool:
         """Halve the height of the bands; return whether any had more than one row of tiles."""
+        self.tiler.reset_room()
         bands = self._bands.get(camera.tiles_y, 1)
         self._bands[camera.tiles_y] = 2 * bands
         return bands < camera.tiles_y
@@ -295,9 +315,12 @@ class Rasterizer:
             self.device.program("depth.cl").paint_depth(
                 items=count, means=gaussians["means"], camera=camera.array, splats=splats, stride=stride, count=count
             )
-        is_single_row = band.row_end - band.row_begin == 1  # cannot be split further
-        limit = MAX_PAIRS if is_single_row else self._limit
-        return self.tiler.build(splats, footprints, band, count, limit, model.defines)
+        rows = band.row_end - band.row_begin
+        limit = MAX_PAIRS if rows == 1 else self._limit  # a single row cannot be split further
+        while True:
+            lists = self.tiler.build(splats, footprints, band, count, limit, model.defines)
+            if rows == camera.tiles_y or self.tiler.has_room(lists):  # the lists of several bands share their memory
+                return lists
 
     def pixel_sums(
         self,

@@ -6,13 +6,15 @@ by (depth, index).  Both break ties by index.
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 
 from clsplat.opencl.device import Array, Device
-from clsplat.render.workspace import Workspace
+from clsplat.render.workspace import GROWTH, Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
 Defines = dict[str, int] | None  # macros of the projection
@@ -33,14 +35,24 @@ class Footprints:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs in emission order, contiguous for each Gaussian, and the depth order of each tile."""
+    """Pairs in emission order, contiguous for each Gaussian, and the depth order of each tile.
 
-    pairs: int
-    pair_splat: Array  # [P] Gaussian of each pair
+    The lists are empty if there are more pairs than `room`; see `Tiler.has_room`.
+    """
+
+    read_pairs: Callable[[], int]  # waits
+    room: int  # pairs that fit
+    limit: int  # of the room
+    pair_splat: Array  # [room] Gaussian of each pair
     first_pair: Array  # [N] first pair of each Gaussian
     tile_count: Array  # [S] pairs of each Gaussian
     tile_offset: Array  # [T+1]
-    tile_pairs: Array  # [P] pairs ordered by tile, front to back
+    tile_pairs: Array  # [room] pairs ordered by tile, front to back
+
+    @cached_property
+    def pairs(self) -> int:
+        """The number of pairs.  Reading it waits until the device has counted them, but not for later work."""
+        return self.read_pairs()
 
 
 @dataclass(frozen=True)
@@ -87,13 +99,15 @@ class Tiler:
         self._radix = device.program("sort_radix.cl")
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
+        self._room = 0  # pairs for which kernels are launched
+        self._all = device.upload(np.array([2**32 - 1], np.uint32))  # a number of keys above any room
 
     def build(
         self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines = None
     ) -> TileLists:
-        """Build the tile lists of `count` splats in a band.  Waits only to read the number of pairs.
+        """Build the tile lists of `count` splats in a band.  Waits only if there is no room for pairs yet.
 
-        Raises TooManyPairs if there are more than `limit`.
+        The lists are valid if `has_room` is true.  limit: of the room.  Raises TooManyPairs like `has_room`.
         """
         if self.sort == "auto":
             self.sort = self._faster_sort(splats, footprints, band, count, limit, defines)
@@ -105,15 +119,16 @@ class Tiler:
         ordered_count = self.workspace.array("ordered_count", count, np.uint32)
         self._scan.permute(items=count, values=tile_count, order=order, permuted=ordered_count, count=count)
         pair_offset = self.scan(ordered_count, count, "pair_offset")
-        pairs = int(pair_offset.get_item(count)) if count else 0
-        if pairs > limit:
-            raise TooManyPairs
+        read_pairs = pair_offset.get_item_later(count)
+        if not self._room:
+            self._make_room(read_pairs(), limit)
+        room = min(self._room, limit)
 
-        pair_tile = self.workspace.array("pair_tile", pairs, np.uint32)
-        pair_splat = self.workspace.array("pair_splat", pairs, np.uint32)
+        pair_tile, pair_splat = self._pair_array("pair_tile", room), self._pair_array("pair_splat", room)
         first_pair = self.workspace.array("first_pair", count, np.uint32)
+        pair_count = self.workspace.array("pair_count", 1, np.uint32)
         self._pairs.emit_pairs(
-            items=count,
+            items=max(count, 1),
             tile_box=footprints.tile_box,
             tile_mask=footprints.tile_mask,
             order=order,
@@ -121,16 +136,43 @@ class Tiler:
             pair_tile=pair_tile,
             pair_splat=pair_splat,
             first_pair=first_pair,
+            pair_count=pair_count,
             tiles_x=band.tiles_x,
+            room=room,
             count=count,
         )
-        program.emit_large(**large, first_pair=first_pair, pair_tile=pair_tile, pair_splat=pair_splat)
-        tiles = band.tiles
+        lists: dict[str, Any] = {"first_pair": first_pair, "pair_splat": pair_splat}
+        program.emit_large(**large, **lists, pair_count=pair_count, pair_tile=pair_tile)
         if self.sort == "radix":
-            tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pairs, tiles)
+            tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pair_count, room, band.tiles)
         else:
-            tile_offset, tile_pairs = self._sort_in_tiles(pair_tile, pair_splat, depth_key, pairs, tiles)
-        return TileLists(pairs, pair_splat, first_pair, tile_count, tile_offset, tile_pairs)
+            tile_offset, tile_pairs = self._sort_in_tiles(
+                pair_tile, pair_splat, depth_key, pair_count, room, band.tiles
+            )
+        lists |= {"tile_count": tile_count, "tile_offset": tile_offset, "tile_pairs": tile_pairs}
+        return TileLists(read_pairs, room, limit, **lists)
+
+    def has_room(self, lists: TileLists) -> bool:
+        """Wait for the number of pairs, and return whether they fit; if not, make room, so that `build` succeeds.
+
+        Raises TooManyPairs if there are more than the limit.
+        """
+        if lists.pairs <= lists.room:
+            return True
+        self._make_room(lists.pairs, lists.limit)
+        return False
+
+    def _make_room(self, pairs: int, limit: int) -> None:
+        if pairs > limit:
+            raise TooManyPairs
+        self._room = min(int(pairs * GROWTH), limit) if self._room else pairs
+
+    def reset_room(self) -> None:
+        """Forget the room for pairs, so that the next lists get exactly what they need."""
+        self._room = 0
+
+    def _pair_array(self, name: str, room: int) -> Array:
+        return self.workspace.array(name, room, np.uint32, slack=1.0)
 
     def _large_arguments(self, splats: Array, footprints: Footprints, band: Band, count: int) -> dict[str, Any]:
         """Return the arguments of both kernels for large splats.  On GPUs, each work-item checks one splat."""
@@ -157,23 +199,29 @@ class Tiler:
         self._scan.scan_offsets(groups=blocks, values=values, block_sum=block_sum, offset=offset, run=run, count=count)
         return offset
 
-    def sort_pairs(self, keys: Array, bits: int, count: int, name: str) -> tuple[Array, Array]:
-        """Sort keys below 2^bits stably; return the sorted keys and their original indices, both [count]."""
+    def sort_pairs(
+        self, keys: Array, bits: int, room: int, name: str, key_count: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Sort keys below 2^bits stably; return the sorted keys and their original indices, both [room].
+
+        key_count: [1] number of keys, by default `room`.
+        """
         passes = -(-bits // self._digit_bits)
         width = -(-bits // passes)
-        run, blocks = self._runs(count, min_run=1 << 10)
+        _, blocks = self._runs(room, min_run=1 << 10)
         values = keys  # the first pass does not read them
         for number in range(passes):
-            arguments = {"shift": number * width, "digits": 1 << min(width, bits - number * width)}
-            arguments |= {"run": run, "blocks": blocks, "count": count}
-            digit_count = self.workspace.array("digit_count", arguments["digits"] * blocks, np.uint32)
-            self._radix.radix_count(groups=blocks, keys=keys, digit_count=digit_count, **arguments)
-            digit_offset = self.scan(digit_count, arguments["digits"] * blocks, "digit_offset")
-            sorted_keys = self.workspace.array(f"{name}_keys{number % 2}", count, np.uint32)
-            sorted_values = self.workspace.array(f"{name}_values{number % 2}", count, np.uint32)
+            digits = 1 << min(width, bits - number * width)
+            arguments: dict[str, Any] = {"groups": blocks, "shift": number * width, "digits": digits, "room": room}
+            arguments |= {"keys": keys, "key_count": key_count or self._all}
+            digit_count = self.workspace.array("digit_count", digits * blocks, np.uint32)
+            self._radix.radix_count(digit_count=digit_count, **arguments)
+            digit_offset = self.scan(digit_count, digits * blocks, "digit_offset")
+            sorted_keys, sorted_values = (
+                self.workspace.array(f"{name}_{part}{number % 2}", room, np.uint32, 1.0 if key_count else GROWTH)
+                for part in ("keys", "values")
+            )
             self._radix.radix_scatter(
-                groups=blocks,
-                keys=keys,
                 values=values,
                 digit_offset=digit_offset,
                 sorted_keys=sorted_keys,
@@ -200,36 +248,35 @@ class Tiler:
             self.workspace.array("index_order", length, np.uint32).set(np.arange(length, dtype=np.uint32))
         return self.workspace.array("index_order", count, np.uint32)
 
-    def _sort_by_tile(self, pair_tile: Array, pairs: int, tiles: int) -> tuple[Array, Array]:
+    def _sort_by_tile(self, pair_tile: Array, pair_count: Array, room: int, tiles: int) -> tuple[Array, Array]:
         bits = max(1, (tiles - 1).bit_length())
-        sorted_tile, tile_pairs = self.sort_pairs(pair_tile, bits, pairs, "tile")
+        sorted_tile, tile_pairs = self.sort_pairs(pair_tile, bits, room, "tile", pair_count)
         tile_offset = self.workspace.array("tile_offset", tiles + 1, np.uint32)
         self._pairs.find_tile_offsets(
-            items=pairs + 1, sorted_tile=sorted_tile, tile_offset=tile_offset, tiles=tiles, count=pairs
+            items=room + 1, sorted_tile=sorted_tile, pair_count=pair_count, tile_offset=tile_offset, tiles=tiles
         )
         return tile_offset, tile_pairs
 
     def _sort_in_tiles(
-        self, pair_tile: Array, pair_splat: Array, depth_key: Array, pairs: int, tiles: int
+        self, pair_tile: Array, pair_splat: Array, depth_key: Array, pair_count: Array, room: int, tiles: int
     ) -> tuple[Array, Array]:
         tile_fill = self.workspace.array("tile_fill", tiles, np.uint32)
         tile_fill.fill(0)
         bitonic = self.device.program("sort_bitonic.cl")
-        bitonic.count_pairs(items=pairs, pair_tile=pair_tile, tile_pair_count=tile_fill, count=pairs)
+        bitonic.count_pairs(items=room, pair_tile=pair_tile, pair_count=pair_count, tile_pair_count=tile_fill)
         tile_offset = self.scan(tile_fill, tiles, "tile_offset")
         tile_fill.fill(0)
-        tile_depth = self.workspace.array("tile_depth", pairs, np.uint32)
-        tile_pairs = self.workspace.array("tile_pairs", pairs, np.uint32)
+        tile_depth, tile_pairs = self._pair_array("tile_depth", room), self._pair_array("tile_pairs", room)
         bitonic.fill_tiles(
-            items=pairs,
+            items=room,
             pair_tile=pair_tile,
             pair_splat=pair_splat,
+            pair_count=pair_count,
             depth_key=depth_key,
             tile_offset=tile_offset,
             tile_fill=tile_fill,
             tile_depth=tile_depth,
             tile_pairs=tile_pairs,
-            count=pairs,
         )
         bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
         return tile_offset, tile_pairs

@@ -19,10 +19,12 @@ class Workspace:
         self.device = device
         self._arrays: dict[str, Array] = {}
 
-    def array(self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32) -> Array:
+    def array(
+        self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32, slack: float = GROWTH
+    ) -> Array:
         """Return an array of this shape; its values are undefined.
 
-        Raises MemoryLimitError if it does not fit, even without slack.
+        slack: factor on its length if it must grow.  Raises MemoryLimitError if it does not fit, even without slack.
         """
         shape = (shape,) if isinstance(shape, int) else shape
         value_type = np.dtype(dtype)
@@ -32,15 +34,17 @@ class Workspace:
             is_growing, array = array is not None, None
             self._arrays.pop(name, None)  # frees the old buffer before the new one is allocated
             array = self._arrays[name] = (
-                self._allocate_with_slack(length, value_type) if is_growing else self.device.zeros(length, value_type)
+                self._allocate_with_slack(length, value_type, slack)
+                if is_growing
+                else self.device.zeros(length, value_type)
             )
         return Array(self.device, array.buffer, shape, value_type)
 
-    def _allocate_with_slack(self, length: int, dtype: np.dtype[Any]) -> Array:
+    def _allocate_with_slack(self, length: int, dtype: np.dtype[Any], slack: float) -> Array:
         """Allocate an array with slack for growth, if the device has enough memory."""
         max_length = self.device.info.allocation // dtype.itemsize
         try:
-            return self.device.zeros(max(length, min(int(length * GROWTH), max_length)), dtype)
+            return self.device.zeros(max(length, min(int(length * slack), max_length)), dtype)
         except MemoryLimitError:
             return self.device.zeros(length, dtype)
 

@@ -102,10 +102,12 @@ class StepTrainer:
         for module in data.modules:
             module.before_render(data)
         camera = data.camera
-        data.frame = self.rasterizer.forward(data.model, camera, data.background, content)
+        data.frame = self.rasterizer.start_forward(data.model, camera, data.background, content)
         timings.section = "loss"
         backgrounds = self.background, data.background
         data.planes = data.photograph.planes(workspace, transforms, step, backgrounds)
+        while not self.rasterizer.is_complete(data.frame):  # the only wait of a step
+            data.frame = self.rasterizer.start_forward(data.model, camera, data.background, content)
         data.image, data.gradient = data.frame.image, workspace.array("grad_image", data.frame.image.shape)
         for module in data.modules:
             module.after_render(data)

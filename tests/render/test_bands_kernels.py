@@ -102,10 +102,10 @@ def test_refused_memory_leads_to_bands_with_the_same_bits(device, rng, monkeypat
     image, pixel_sums, frame = results(device, case, weights)
     most, array = frame.lists.pairs // 2, Workspace.array
 
-    def refusing(workspace, name, shape, *dtype):
+    def refusing(workspace, name, shape, *dtype, **slack):
         if name == refused and (shape if isinstance(shape, int) else shape[0]) > most:
             raise MemoryLimitError("no memory is left")
-        return array(workspace, name, shape, *dtype)
+        return array(workspace, name, shape, *dtype, **slack)
 
     monkeypatch.setattr(Workspace, "array", refusing)
     sort = "bitonic" if refused == "tile_pairs" else "radix"
@@ -115,6 +115,25 @@ def test_refused_memory_leads_to_bands_with_the_same_bits(device, rng, monkeypat
         np.testing.assert_array_equal(refused_image, image)
         np.testing.assert_array_equal(refused_sums, pixel_sums)
     assert max(rasterizer._bands.values()) > 1
+
+
+@on_devices("missing, sort", each_once([1, None], ["radix", "bitonic"]))
+def test_frame_with_too_little_room_is_repeated(device, rng, missing, sort):
+    """Room for all pairs but `missing`, or for a single pair."""
+    case = random_case(rng, 300, 60, 70)
+    case.parameters["log_scales"][:20] += 1.5  # some are listed by another kernel
+    weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
+    image, pixel_sums, frame = results(device, case, weights)
+    pairs, rasterizer = frame.lists.pairs, Rasterizer(device, sort)
+    rasterizer.tiler._room = pairs - missing if missing else 1
+    incomplete = rasterizer.start_forward(case.model(device), case.device_camera(device), device.zeros(3))
+    assert not incomplete.lists.tile_offset.get()[: incomplete.camera.tiles + 1].any()
+    assert not incomplete.image.get().any()
+    rasterizer.tiler._room = pairs - missing if missing else 1
+    repeated_image, repeated_sums, repeated = results(device, case, weights, rasterizer=rasterizer)
+    assert repeated.lists.room >= pairs
+    np.testing.assert_array_equal(repeated_image, image)
+    np.testing.assert_array_equal(repeated_sums, pixel_sums)
 
 
 @on_one_setting

@@ -189,7 +189,7 @@ def test_miscounted_large_splat_is_blended_once(device, rng, monkeypatch, sort, 
     lists = frame.lists
     assert lists.pairs == pairs + surplus
     tile = np.repeat(np.arange(frame.camera.tiles), np.diff(lists.tile_offset.get()))
-    names = np.stack([tile, lists.pair_splat.get()[lists.tile_pairs.get()]])
+    names = np.stack([tile, lists.pair_splat.get()[lists.tile_pairs.get()[: lists.pairs]]])
     assert len(np.unique(names, axis=1)[0]) == lists.pairs
     if surplus > 0:
         np.testing.assert_array_equal(frame.image.get(), image)
@@ -206,12 +206,14 @@ def _emitted(device, frame, box, mask, count):
     pair_tile, pair_splat = (device.upload(np.full(guarded, untouched)) for _ in range(2))
     first_pair = device.zeros(len(count), np.uint32)
     written = {"first_pair": first_pair, "pair_tile": pair_tile, "pair_splat": pair_splat}
+    written["pair_count"] = device.zeros(1, np.uint32)
     size = {"tile_box": device.upload(box), "tiles_x": frame.camera.tiles_x, "count": len(count)}
     device.program("pairs.cl").emit_pairs(
         items=len(count),
         tile_mask=device.upload(mask),
         order=device.upload(np.arange(len(count), dtype=np.uint32)),
         pair_offset=device.upload(offset),
+        room=int(offset[-1]),
         **written,
         **size,
     )
