@@ -26,7 +26,7 @@ from clsplat.data_tools.synthetic import SyntheticOptions, write_dataset
 from clsplat.opencl import device as opencl_device
 from clsplat.opencl import device as program
 from clsplat.opencl.device import Array, Device, Kernel, Program
-from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.opencl.discovery import DeviceInfo, choose_device
 from clsplat.pipeline import loading, plugins, yaml_file
 from clsplat.scene.reader import Reader
 from clsplat.sweeps.store import Store
@@ -154,7 +154,7 @@ def device(request: pytest.FixtureRequest) -> Device:
 def opened(name: str, tuning: str) -> Device:
     """A device with one of the settings; cases of a test take them in turn."""
     schedule, lanes = TUNINGS[tuning]
-    result = Device(choose(name or None), schedule)
+    result = Device(choose_device(name or None), schedule)
     result.tuning["LANES"] = lanes
     return result
 
@@ -162,7 +162,7 @@ def opened(name: str, tuning: str) -> Device:
 @pytest.fixture(scope="session")
 def info() -> DeviceInfo:
     """The first device that is tested."""
-    return choose(NAMES[0] or None)
+    return choose_device(NAMES[0] or None)
 
 
 @pytest.fixture

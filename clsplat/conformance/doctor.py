@@ -20,7 +20,7 @@ from clsplat.core.errors import pluralize
 from clsplat.core.files import check_result_path, raising_output_error, write_text
 from clsplat.core.page import duration_text, render
 from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import DeviceInfo, choose, resolve_schedule
+from clsplat.opencl.discovery import DeviceInfo, choose_device, resolve_schedule
 from clsplat.opencl.kernel_caches import kernel_caches
 
 BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # kernels that `rasterizer.sort: radix` does not use
@@ -206,7 +206,7 @@ SCHEDULES: tuple[Literal["simt", "wide"], ...] = ("simt", "wide")
 
 def examine(device: str | Device | None = None) -> DeviceReport:
     """Run all checks on a device; None chooses the default one.  Raises DeviceError if no device works."""
-    info = device.info if isinstance(device, Device) else choose(device)
+    info = device.info if isinstance(device, Device) else choose_device(device)
     default = resolve_schedule(info, "auto")
     report, start_time = DeviceReport(info, default), time.perf_counter()
     LOG.info("checking %s; this takes a minute or two on a CPU", info.text)

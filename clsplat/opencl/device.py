@@ -25,8 +25,8 @@ from numpy.typing import DTypeLike, NDArray
 from clsplat.core.errors import ConfigError, DeviceError, KernelError, MemoryLimitError
 from clsplat.core.resources import resource_dir
 from clsplat.opencl import runtimes
-from clsplat.opencl.discovery import DeviceInfo, Schedule, choose, platforms, resolve_schedule, tuning_macros
-from clsplat.opencl.kernel_caches import kernel_caches, remove_cut_kernels
+from clsplat.opencl.discovery import DeviceInfo, Schedule, choose_device, get_platforms, resolve_schedule, tuning_macros
+from clsplat.opencl.kernel_caches import kernel_caches, remove_broken_kernels
 
 runtimes.prepare()
 import pyopencl as cl  # noqa: E402
@@ -163,13 +163,13 @@ class Device:
     """
 
     def __init__(self, name: str | DeviceInfo | None = None, schedule: Schedule = "auto") -> None:
-        info = name if isinstance(name, DeviceInfo) else choose(name)
+        info = name if isinstance(name, DeviceInfo) else choose_device(name)
         platform, number = info.index
         self.info = info
-        remove_cut_kernels()
+        remove_broken_kernels()
         flags = cl.command_queue_properties.PROFILING_ENABLE
-        with self.raising_errors("opening it"):
-            self.context = create_context(platforms()[platform].get_devices()[number])
+        with self.raising_errors("opening the device"):
+            self.context = create_context(get_platforms()[platform].get_devices()[number])
             self._queues = {False: cl.CommandQueue(self.context), True: cl.CommandQueue(self.context, properties=flags)}
         self._sampling = False  # whether the profiling queue is in use, which costs host time
         self.schedule = resolve_schedule(info, schedule)
@@ -270,7 +270,7 @@ class Device:
 
     def finish(self) -> None:
         """Wait for all enqueued work.  Raises MemoryLimitError, DeviceError."""
-        with self.raising_errors("work in progress"):
+        with self.raising_errors("enqueued work"):
             self.queue.finish()
 
     def raising_errors(self, action: str) -> AbstractContextManager[None]:
@@ -284,7 +284,7 @@ def create_context(device: Any) -> Any:
 
 
 def open_device(device: str | Device | None = None, schedule: Schedule = "auto") -> Device:
-    """Open the device whose name contains `device`, by default the one that `choose` selects.
+    """Open the device whose name contains `device`, by default the one that `choose_device` selects.
 
     An open Device is returned unchanged.  Raises DeviceError if no device matches, and ConfigError for an open
     device with another schedule.
@@ -294,7 +294,7 @@ def open_device(device: str | Device | None = None, schedule: Schedule = "auto")
     if not isinstance(device, Device):
         raise ConfigError(f"device: expected part of a device name, or a Device, got {type(device).__name__}")
     if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:
-        raise ConfigError(f"device: {device.text}; the settings need the schedule {schedule}; open the device with it")
+        raise ConfigError(f"device: {device.text}; the settings need {schedule}: open it with schedule='{schedule}'")
     return device
 
 
@@ -364,7 +364,7 @@ class Argument:
 
     name: str
     dtype: np.dtype[Any] | None  # None: a struct, whose layout a test checks
-    pointer: bool
+    is_pointer: bool
 
 
 def parse_kernels(source: str) -> dict[str, list[Argument]]:
@@ -410,7 +410,7 @@ class Kernel:
     def __init__(self, device: "Device", label: str, kernel: Any, arguments: list[Argument]) -> None:
         self.label, self.arguments = label, arguments
         self._device, self._kernel = device, kernel
-        self._kernel.set_scalar_arg_dtypes([None if a.pointer else a.dtype for a in arguments])
+        self._kernel.set_scalar_arg_dtypes([None if a.is_pointer else a.dtype for a in arguments])
         info, cl_device = cl.kernel_work_group_info, device.context.devices[0]
         self.group = tuple(int(n) for n in kernel.get_work_group_info(info.COMPILE_WORK_GROUP_SIZE, cl_device))
         items, limit = math.prod(self.group), group_limit(kernel, cl_device)
@@ -431,19 +431,19 @@ class Kernel:
             size = tuple(n * g for n, g in zip(size, local, strict=True))
         if 0 in size:
             return
-        arguments = self._check(values)
+        arguments = self._check_arguments(values)
         with self._device.lock, self._device.raising_errors(self.label):  # arguments must not change until enqueued
             self._kernel.set_args(*arguments)
             event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
         self._device.timings.add(self.label, event)
 
-    def _check(self, values: dict[str, Any]) -> list[Any]:
+    def _check_arguments(self, values: dict[str, Any]) -> list[Any]:
         if len(values) != len(self.arguments):
             self._raise_argument_error(values)
         result = []
         for argument in self.arguments:
             value = values.get(argument.name)
-            if not argument.pointer and value is not None:
+            if not argument.is_pointer and value is not None:
                 result.append(value)
             elif isinstance(value, Array) and (argument.dtype is None or value.dtype == argument.dtype):
                 result.append(value.buffer)
@@ -457,7 +457,7 @@ class Kernel:
         mismatches = [
             f"{name} is {getattr(value, 'dtype', type(value).__name__)}, expected {expected[name].dtype or 'a struct'}"
             for name, value in values.items()
-            if name in expected and expected[name].pointer and getattr(value, "dtype", None) != expected[name].dtype
+            if name in expected and expected[name].is_pointer and getattr(value, "dtype", None) != expected[name].dtype
         ]
         faults = [f"missing arguments {', '.join(sorted(missing))}"] if missing else []
         faults += [f"unknown arguments {', '.join(sorted(unexpected))}"] if unexpected else []

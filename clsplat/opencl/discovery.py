@@ -65,7 +65,7 @@ def list_devices() -> list[DeviceInfo]:
     A device that cannot be queried is omitted, with a warning.
     """
     infos = []
-    for p, platform in enumerate(platforms()):
+    for p, platform in enumerate(get_platforms()):
         devices: list[Any] = []
         with _warn_on_error(f"OpenCL platform {p}: its devices cannot be listed", "DEVICE_NOT_FOUND"):
             devices = platform.get_devices()
@@ -75,7 +75,7 @@ def list_devices() -> list[DeviceInfo]:
     return infos
 
 
-def platforms() -> list[Any]:
+def get_platforms() -> list[Any]:
     """Return the platforms of the loader, or an empty list without runtimes.  Raises the errors of `check_runtimes`."""
     runtimes.check_runtimes(f"{cl.VERSION_TEXT} {cl.__file__}")
     with _warn_on_error("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
@@ -117,7 +117,7 @@ def _short_version(version: str) -> str:
     return " ".join(version.split(",")[0].split()[:4])
 
 
-def choose(device_name: str | None = None) -> DeviceInfo:
+def choose_device(device_name: str | None = None) -> DeviceInfo:
     """Choose a device, and log the devices that do not work.
 
     `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, counted from 0.  The default
@@ -134,9 +134,9 @@ def choose(device_name: str | None = None) -> DeviceInfo:
     for info in sorted(devices, key=_rank):
         fault = info.fault()
         if fault is None:
-            gpus = [device.text for device in devices if device.kind == info.kind == "GPU" and device is not info]
-            if gpus:
-                LOG.info("using %s; other GPUs: %s; select one with --device NAME", info.text, "; ".join(gpus))
+            other_gpus = [device.text for device in devices if device.kind == info.kind == "GPU" and device is not info]
+            if other_gpus:
+                LOG.info("using %s; other GPUs: %s; select one with --device NAME", info.text, "; ".join(other_gpus))
             return info
         faults.append(f"{info.text} does not work: {fault}")
         LOG.warning("%s", faults[-1])
@@ -148,8 +148,8 @@ def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
 
     The number of units alone does not suffice, because vendors define compute units differently.
     """
-    gpu = info.kind == "GPU"
-    return ("GPU", "CPU", "other").index(info.kind), gpu and info.unified, -info.units * info.clock if gpu else 0
+    is_gpu = info.kind == "GPU"
+    return ("GPU", "CPU", "other").index(info.kind), is_gpu and info.unified, -info.units * info.clock if is_gpu else 0
 
 
 def _find_by_name(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:

@@ -55,7 +55,7 @@ def _full_cache_fault() -> str:
 
 
 @cache
-def remove_cut_kernels() -> None:
+def remove_broken_kernels() -> None:
     """Remove files that a power failure truncated, because PoCL crashes when it loads such kernels.
 
     This runs once per boot if the system has a boot ID, else once per process.

@@ -52,7 +52,7 @@ def main(platform: int, device: int) -> None:
     lanes = 16 if cl_device.native_vector_width_float >= 16 else 8 if cl_device.native_vector_width_float >= 8 else 4
     program = cl.Program(context, SOURCE % {"lanes": lanes}).build(["-cl-std=CL1.2"])
     if WITHOUT_VECTORS in program.get_build_info(cl_device, cl.program_build_info.LOG):
-        raise SystemExit("error: kernels are compiled without the vectors of the processor")
+        raise SystemExit("error: kernels are compiled without the processor's vector instructions")
     cl.Kernel(program, "reverse")(queue, (8,), (8,), source, reversed_values)
     result = np.empty_like(values)
     cl.enqueue_copy(queue, result, reversed_values)

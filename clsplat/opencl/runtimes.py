@@ -18,7 +18,7 @@ from clsplat.core.errors import DataError, DeviceError, MemoryLimitError, Output
 from clsplat.core.files import write_text
 from clsplat.core.machine import Owner, cache_folder, process_limit
 from clsplat.core.reading import read_text
-from clsplat.opencl.kernel_caches import empty_kernel_caches, kernel_cache_advice, remove_cut_kernels, require_space
+from clsplat.opencl.kernel_caches import empty_kernel_caches, kernel_cache_advice, remove_broken_kernels, require_space
 
 SYSTEM_DRIVERS = Path("/etc/OpenCL/vendors")
 PROBE = Path(__file__).with_name("probe.py")
@@ -34,12 +34,12 @@ LOADER_VARIABLES = (*VARIABLES, "LD_LIBRARY_PATH", "LD_PRELOAD")  # these determ
 MIN_ADDRESS_SPACE = 1800 << 20  # bytes: with two cores, a run needs about this much
 LOADING_SECONDS = 60  # drivers of large servers may take ten
 LOADING, LOADED = "clsplat loads the runtimes", "clsplat has listed the devices"  # lines of the child process
-_HANGS = f"a test kernel did not finish in {PROBE_SECONDS} s"
-_NO_EXECUTION = "PoCL's cache is on a file system mounted with `noexec`: mount it with `exec`, or set POCL_CACHE_DIR"
+_TIMEOUT = f"a test kernel did not finish in {PROBE_SECONDS} s"
+_NOEXEC = "PoCL's cache is on a file system mounted with `noexec`: mount it with `exec`, or set POCL_CACHE_DIR"
 OTHER_DRIVERS = "remove this file, or set OCL_ICD_VENDORS to a folder with the .icd files of the other runtimes"
 _OTHER_RUNTIMES = "apt install pocl-opencl-icd, or pip install '.[intel]' in a checkout"
 _ADVICE = (  # text in the output of a failed test kernel, and advice
-    ("without the vectors", f"this runtime does not support the processor: {_OTHER_RUNTIMES}"),
+    ("without the processor's vector", f"this runtime does not support the processor: {_OTHER_RUNTIMES}"),
     ("unknown target cpu", f"this PoCL does not support the processor: {_OTHER_RUNTIMES}"),
     ("invalid_kernel_name", f"this runtime may not support the processor: {_OTHER_RUNTIMES}"),
     ("linker", f"PoCL needs a linker: apt install binutils libc6-dev; or use another runtime: {_OTHER_RUNTIMES}"),
@@ -71,7 +71,7 @@ def no_device_advice() -> str:
 
 
 def _user_variables() -> str:
-    """Return those of VARIABLES that the user has set, as `NAME=VALUE, …`; '' if there are none."""
+    """Return the variables among VARIABLES that the user has set, as `NAME=VALUE, …`; '' if there are none."""
     folders = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # in values that `prepare` has set
     values = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, folders[0]).startswith(folders)}
     return ", ".join(f"{name}={quote(value)}" for name, value in values.items())
@@ -174,12 +174,12 @@ def probe_fault(key: str, platform: int, device: int) -> str | None:
     record = cache_folder() / "probes" / hashlib.sha256(content).hexdigest()[:16]
     if os.path.exists(record):  # unlike Path.exists, False in a folder of another user
         return None
-    remove_cut_kernels()
+    remove_broken_kernels()
     fault = _run_probe(platform, device, {})
     if fault is None:
         with suppress(OutputError):
             write_text(record, key)
-    elif fault not in (_HANGS, _NO_EXECUTION):
+    elif fault not in (_TIMEOUT, _NOEXEC):
         with empty_kernel_caches() as variables:
             if _run_probe(platform, device, variables) is None:
                 return kernel_cache_advice()
@@ -190,12 +190,12 @@ def _run_probe(platform: int, device: int, variables: Mapping[str, str]) -> str 
     """Test a device in a child process with additional environment variables; return the fault, or None."""
     result = run_module(PROBE_MODULE, str(platform), str(device), seconds=PROBE_SECONDS, variables=variables)
     if result.code is None:
-        return _HANGS
+        return _TIMEOUT
     if result.code == 0:
         return None
     output = result.output
     if "failed to map segment" in output.lower():
-        return _NO_EXECUTION
+        return _NOEXEC
     reason = "the runtime aborts the process" if result.crash else _error_line(output)
     for pattern, advice in _ADVICE:
         if pattern in f"{output} {reason}".lower():

@@ -12,15 +12,15 @@ from clsplat.render.workspace import Workspace
 
 @dataclass(frozen=True)
 class OverlayLayer:
-    """A layer composited over an image; valid until the next call of `lay_over`."""
+    """A layer composited over an image; valid until the next call of `composite_layer`."""
 
     frame: Frame  # of the layer only, over black
     image: Array  # composite, [3 or 4, rows, stride]
-    behind: Array  # T dL/dT of the loss on the layer's alpha, [1, rows, stride]
+    transmittance_gradient: Array  # T dL/dT of the loss on the layer's alpha, [1, rows, stride]
     loss: Callable[[], float]  # returns the value of that loss; waits for the device
 
 
-def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> OverlayLayer:
+def composite_layer(workspace: Workspace, frame: Frame, image: Array, scale: float) -> OverlayLayer:
     """Composite a layer, rendered over black, onto an image, [3 or 4, rows, stride].
 
     scale: weight of the loss on the layer's alpha, the sum of 1 - T over pixels.
@@ -43,7 +43,7 @@ def lay_over(workspace: Workspace, frame: Frame, image: Array, scale: float) -> 
     return OverlayLayer(frame, composite, behind, lambda: scale * float(np.asarray(sums.get()).sum(dtype=np.float64)))
 
 
-def look_behind(workspace: Workspace, frame: Frame, gradient: Array) -> None:
+def backpropagate_composite(workspace: Workspace, frame: Frame, gradient: Array) -> None:
     """Convert the gradient of the composite, [3 or 4, rows, stride], to that of the image behind, in place."""
     camera = frame.camera
     workspace.device.program("layer.cl").look_behind(

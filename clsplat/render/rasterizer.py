@@ -80,7 +80,7 @@ def add_inverse_depth_gradient(workspace: Workspace, camera: DeviceCamera, splat
     )
 
 
-def shape_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
+def projection_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, Any]:
     """Return the arguments shared by all kernels that project Gaussians, by name.
 
     Harmonics of Gaussians outside the view may have deferred updates; these kernels do not read them.
@@ -115,7 +115,7 @@ def project(
     footprints = Footprints(*(workspace.array(field.name, stride, np.uint32) for field in fields(Footprints)))
     device.program("project.cl", **model.defines).project_forward(
         items=-(-count // int(device.tuning["LANES"])),
-        **shape_arguments(model, camera),
+        **projection_arguments(model, camera),
         sh_base=gaussians["sh_base"],
         **visibility_arguments(model, camera.view, workspace.array("left_out", stride)),
         splats=splats,
@@ -181,8 +181,9 @@ def pose_gradient(
     device = workspace.device
     items = -(-model.gaussians.count // int(device.tuning["LANES"]))
     sums = workspace.array("pose sums", (POSE_SUMS, -(-items // POSE_GROUP)))
+    arguments = projection_arguments(frame.model, frame.camera)
     device.program("poses.cl", **model.defines).pose_gradient(
-        items=items, **shape_arguments(frame.model, frame.camera), splats=frame.splats, pixel_sums=pixel_sums, sums=sums
+        items=items, **arguments, splats=frame.splats, pixel_sums=pixel_sums, sums=sums
     )
     read_group_sums = sums.get_later()
     return lambda: np.cumsum(read_group_sums(), axis=1, dtype=np.float64)[:, -1]
@@ -329,18 +330,18 @@ class Rasterizer:
         grad_image: Array,
         count: int = PIXEL_SUMS,
         texture: Array | None = None,
-        behind: Array | None = None,
+        transmittance_gradient: Array | None = None,
     ) -> Array:
         """Return the sums over each Gaussian's pixels that determine its gradients, [count, S] (cl_kernels/splat.h).
 
         grad_image: in the layout of the frame's image, zero outside it.  A `count` above PIXEL_SUMS is slower; texture
-        sums need `texture`, [rows, stride], negative if unknown.  behind: [rows, stride] T dL/dT of a loss on the
-        transmittance T.  Memory is limited as in `forward`.
+        sums need `texture`, [rows, stride], negative if unknown.  transmittance_gradient: [rows, stride] T dL/dT of a
+        loss on the transmittance T.  Memory is limited as in `forward`.
         """
         bands = frame.bands
         while True:
             try:
-                return self._pixel_sums(model, frame, bands, grad_image, count, texture, behind)
+                return self._pixel_sums(model, frame, bands, grad_image, count, texture, transmittance_gradient)
             except MemoryLimitError:
                 if not self._halve_bands(frame.camera):
                     raise
@@ -354,10 +355,10 @@ class Rasterizer:
         grad_image: Array,
         count: int,
         texture: Array | None,
-        behind: Array | None,
+        transmittance_gradient: Array | None,
     ) -> Array:
         defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
-        blend_defines = {**defines, "GRAD_BEHIND": 1} if behind else defines
+        blend_defines = {**defines, "GRAD_BEHIND": 1} if transmittance_gradient else defines
         pixel_sums = self.workspace.array("pixel_sums", (count, model.gaussians.capacity))
         for i, band in enumerate(bands):
             lists = frame.lists
@@ -375,7 +376,7 @@ class Rasterizer:
                     image=frame.image,
                     grad_image=grad_image,
                     texture=texture or frame.transmittance,  # the kernel reads it only with texture sums
-                    behind=behind or frame.transmittance,
+                    behind=transmittance_gradient or frame.transmittance,
                     tile_last=frame.tile_last,
                     pair_sums=pair_sums,
                     first_tile=first_tile,
@@ -392,7 +393,7 @@ class Rasterizer:
         gradients = self._gradients
         self.device.program("project.cl", **model.defines).project_backward(
             items=-(-model.gaussians.count // self._lanes),
-            **shape_arguments(frame.model, frame.camera),
+            **projection_arguments(frame.model, frame.camera),
             splats=frame.splats,
             pixel_sums=pixel_sums,
             **gradients.arguments(),

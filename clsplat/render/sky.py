@@ -27,13 +27,13 @@ class Runs:
     camera: Array  # [1] camera_t
     runs: Array  # [R, RUN_WORDS] uint32
     strips: Array  # [strips + 1] uint32, first run of each work item
-    shown: Array  # [texels] uint32, texels in the view
+    texels: Array  # [texels] uint32, texels in the view
     first_entry: Array  # [texels + 1] uint32
     entries: Array  # [R * CORNERS] uint32, run * CORNERS + corner, by texel
 
     @property
     def nbytes(self) -> int:
-        return sum(array.nbytes for array in (self.runs, self.strips, self.shown, self.first_entry, self.entries))
+        return sum(array.nbytes for array in (self.runs, self.strips, self.texels, self.first_entry, self.entries))
 
 
 def ray_directions(values: NDArray[np.void], width: int, height: int) -> NDArray[np.float64]:
@@ -90,10 +90,10 @@ class Skies:
         words = run_words(values, camera.width, camera.height, side)
         texel = words[:, -CORNERS:].ravel()
         entries = np.argsort(texel, kind="stable")
-        shown_texels, first_entry = np.unique(texel[entries], return_index=True)
+        visible_texels, first_entry = np.unique(texel[entries], return_index=True)
         rows = np.arange(camera.height + 1)
         strips = np.searchsorted(words[:, 0], rows) if self._lanes > 1 else np.arange(len(words) + 1)
-        arrays = words, strips, shown_texels, np.append(first_entry, len(entries)), entries
+        arrays = words, strips, visible_texels, np.append(first_entry, len(entries)), entries
         return Runs(camera.array, *(self.device.upload(array.astype(np.uint32)) for array in arrays))
 
     def paint(self, sky: DeviceSky, camera: DeviceCamera, image: Array, transmittance: Array) -> None:
@@ -112,7 +112,7 @@ class Skies:
             **_sizes(sky, camera),
         )
 
-    def cover(
+    def coverage_loss(
         self,
         sky: DeviceSky,
         free: Array,
@@ -162,7 +162,7 @@ class Skies:
     def grad_texels(self, sky: DeviceSky, camera: DeviceCamera, transmittance: Array, gradient: Array) -> Array:
         """Return the gradient of the texels in the view, [3, texels], from the gradient of the image."""
         runs = self.runs(camera, sky.side)
-        count, texel_count = runs.runs.shape[0], runs.shown.shape[0]
+        count, texel_count = runs.runs.shape[0], runs.texels.shape[0]
         sums, result = (
             self.workspace.array("run sums", (count, RUN_SUMS)),
             self.workspace.array("texels", (3, texel_count)),
@@ -197,8 +197,8 @@ class Skies:
         """
         runs = self.runs(camera, sky.side)
         self._program.sky_update(
-            items=runs.shown.shape[0],
-            shown_texels=runs.shown,
+            items=runs.texels.shape[0],
+            shown_texels=runs.texels,
             grad_texels=grad_texels,
             texels=sky.texels,
             free=moments["free"],
@@ -208,7 +208,7 @@ class Skies:
             rate=rate,
             pixels=3.0 * camera.width * camera.height,
             map_plane=sky.side**2,
-            shown=runs.shown.shape[0],
+            shown=runs.texels.shape[0],
         )
 
 

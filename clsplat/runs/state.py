@@ -114,7 +114,8 @@ class RunState:
         """Describe how a continued training differs from training with all steps from the start; "" if it does not."""
         training = self.pipeline.settings.training
         steps = training.steps
-        names = [s.stage for s in training.during if type(s).stale is not Scheduled.stale and s.is_due(steps)]
+        stages = (s for s in training.during if type(s).frozen_parameters is not Scheduled.frozen_parameters)
+        names = [stage.stage for stage in stages if stage.is_due(steps)]
         if not names or self.status.get("step", 0) < steps:
             return ""
         return f"'{names[0]}' was due at step {steps}, the last one, so the result differs from a run planned as long"

@@ -77,7 +77,7 @@ class Densify(Scheduled):
             raise ValueError("'budget' needs 'stop', the step at which the budget is reached")
         return self
 
-    def stale(self, run: Run) -> Collection[str]:
+    def frozen_parameters(self, run: Run) -> Collection[str]:
         return run.model.gaussians.trained
 
     def run(self, run: Run) -> None:

@@ -386,13 +386,13 @@ class Optimize(ValidatedTraining):
         run.step += 1
         run.stage_step += 1
         try:
-            view, stale = self._differentiate(run, trainer, sampler)
+            view, frozen = self._differentiate(run, trainer, sampler)
         except BaseException:  # also a second Ctrl-C
             run.step, run.stage_step = run.step - 1, run.stage_step - 1
             run.device.timings.sampling = False
             raise
         with run.editing_tables():
-            trainer.update(view, stale)
+            trainer.update(view, frozen)
             run.during_index, run.edited = 0, False
         run.device.timings.sampling = False
         run.status.note(step=run.step)
@@ -405,7 +405,7 @@ class Optimize(ValidatedTraining):
         photograph = run.photographs.get_usable(sample.view, sample.original, sample.number)
         offsets = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
         run.photographs.prefetch(sampler.at(run.step + offset).view for offset in offsets)
-        stale = {name for stage in self.during if stage.is_due(run.step) for name in stage.stale(run)}
+        frozen = {name for stage in self.during if stage.is_due(run.step) for name in stage.frozen_parameters(run)}
         trainer.losses = [*self.losses, *run.losses]
         view = trainer.differentiate(photograph, run.step, sample.transforms)
-        return view, set() if run.stage_step == self.steps else stale
+        return view, set() if run.stage_step == self.steps else frozen

@@ -58,7 +58,7 @@ class PaletteSh(Scheduled):
     step: Annotated[float, Field(gt=0)] | None = None
     """Step to which the coefficients are rounded, if at most 256 values result; larger steps make smaller files."""
 
-    def stale(self, run: Run) -> Collection[str]:
+    def frozen_parameters(self, run: Run) -> Collection[str]:
         return "sh_base", "sh_rest"
 
     def run(self, run: Run) -> None:

@@ -82,7 +82,7 @@ class PruneLeast(Scheduled):
             raise ValueError("set either 'keep' or 'remove' to a fraction of the Gaussians, not both")
         return self
 
-    def stale(self, run: Run) -> Collection[str]:
+    def frozen_parameters(self, run: Run) -> Collection[str]:
         return run.model.gaussians.trained
 
     def run(self, run: Run) -> None:
@@ -119,7 +119,7 @@ class ReduceSh(Scheduled):
     share: Share = 0
     """Fraction of all bands of all Gaussians to set to zero, the least important ones."""
 
-    def stale(self, run: Run) -> Collection[str]:
+    def frozen_parameters(self, run: Run) -> Collection[str]:
         return ("sh_rest",)
 
     def run(self, run: Run) -> None:

@@ -42,7 +42,7 @@ class ResetOpacity(Scheduled):
     when_background: Literal["black", "white"] | None = None
     """Background with which the stage acts; default: any."""
 
-    def stale(self, run: Run) -> Collection[str]:
+    def frozen_parameters(self, run: Run) -> Collection[str]:
         return ("logit_opacity",) if self._is_active(run) else ()
 
     def run(self, run: Run) -> None:

@@ -21,7 +21,7 @@ from clsplat.core.files import write_text
 from clsplat.core.machine import Owner, cache_folder
 from clsplat.core.manifest import hash_values
 from clsplat.core.reading import read_json, sha256
-from clsplat.opencl.discovery import DeviceInfo, choose, list_devices
+from clsplat.opencl.discovery import DeviceInfo, choose_device, list_devices
 from clsplat.opencl.runtimes import no_device_error
 from clsplat.pipeline.files import shipped_pipelines
 from clsplat.sweeps.cell import code_digest
@@ -87,7 +87,7 @@ def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) 
     Raises DeviceError if no device or a named device does not work, and ConfigError if there are more runs than cores.
     """
     infos = list_devices()
-    subset = [choose(name) for name in devices] if devices is not None else [info for info in infos if not info.fault()]
+    subset = [info for info in infos if not info.fault()] if devices is None else [*map(choose_device, devices)]
     if not subset:
         raise no_device_error("no OpenCL device works", "`clsplat devices` shows why")
     slots = []

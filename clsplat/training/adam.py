@@ -15,7 +15,7 @@ from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.sh_offload import slot_arguments, slot_defines
 from clsplat.gaussians.structs import DeferredUpdates, GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
-from clsplat.render.rasterizer import Frame, shape_arguments
+from clsplat.render.rasterizer import Frame, projection_arguments
 from clsplat.training.motion import MotionRates, update_motion
 
 
@@ -140,7 +140,7 @@ class Adam:
         program = gaussians.device.program("adam.cl", **model.defines)
         program.update_gaussians(
             items=-(-gaussians.count // (self._lanes * self._vectors)),
-            **shape_arguments(model, frame.camera),
+            **projection_arguments(model, frame.camera),
             **arguments,
             sh_rest_degree=model.degree if rates["sh_rest"] else 0,
             every=_EVERY[rows],

@@ -130,8 +130,8 @@ class Scheduled(Stage):
         """Return whether to run the stage now in addition to its cadence; only for stages that never change results."""
         return False
 
-    def stale(self, run: Run) -> Collection[str]:
-        """Return the parameters whose gradients are invalid after the edit."""
+    def frozen_parameters(self, run: Run) -> Collection[str]:
+        """Return the parameters that a step does not update, because the edit after it invalidates their gradients."""
         return ()
 
 

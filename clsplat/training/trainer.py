@@ -70,15 +70,15 @@ class StepTrainer:
         photograph: Photograph,
         step: int,
         transforms: Sequence[PhotographTransform] = (),
-        stale: Collection[str] = (),
+        frozen: Collection[str] = (),
     ) -> ViewGradients:
-        """Train on one view at a global step.  stale: parameters that are not updated.
+        """Train on one view at a global step.  frozen: parameters that are not updated.
 
         Returns the losses and the gradients, which are valid until the next step.
         """
-        view = self.differentiate(photograph, step, transforms)
-        self.update(view, stale)
-        return view
+        gradients = self.differentiate(photograph, step, transforms)
+        self.update(gradients, frozen)
+        return gradients
 
     def differentiate(
         self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()
@@ -127,56 +127,56 @@ class StepTrainer:
         data.losses += data.module_losses
         return ViewLosses(data.frame, comparison, data.losses, step=data)
 
-    def backward(self, view: ViewLosses) -> ViewGradients:
+    def backward(self, losses: ViewLosses) -> ViewGradients:
         """Differentiate the losses that `compare` returned; return them with the gradient, as sums over pixels."""
-        data, workspace, count = view.step, self.rasterizer.workspace, self.stats.pixel_sums
+        data, workspace, sum_count = losses.step, self.rasterizer.workspace, self.stats.pixel_sums
         mask = data.planes.mask
         if mask is not None:
             apply_mask(workspace, data.camera, data.gradient, mask)
         for module in reversed(data.modules):
             module.backward(data)
         self.rasterizer.device.timings.section = "statistics"
-        texture = unmasked_gradient(workspace, data.camera, data.planes.colors, mask) if count > TEXTURE else None
+        texture = unmasked_gradient(workspace, data.camera, data.planes.colors, mask) if sum_count > TEXTURE else None
         data.pixel_sums = self.rasterizer.pixel_sums(
-            data.model, data.frame, data.gradient, count, texture, data.transmittance_gradient
+            data.model, data.frame, data.gradient, sum_count, texture, data.transmittance_gradient
         )
         for module in reversed(data.modules):
             module.after_backward(data)
         return ViewGradients(data.frame, data.comparison, data.losses, data.pixel_sums, step=data)
 
-    def update(self, view: ViewGradients, stale: Collection[str] = ()) -> None:
+    def update(self, gradients: ViewGradients, frozen: Collection[str] = ()) -> None:
         """Apply the result of `differentiate`: update parameters, moments, statistics, and modules."""
-        grad_mean2d = self._update(view, stale)
-        for module in reversed(view.step.modules):  # in the order in which the device finished their gradients
-            module.update(view.step)
+        grad_mean2d = self._update_parameters(gradients, frozen)
+        for module in reversed(gradients.step.modules):  # in the order in which the device finished their gradients
+            module.update(gradients.step)
         self.rasterizer.device.timings.section = "statistics"
-        self.stats.add(view, grad_mean2d)
+        self.stats.add(gradients, grad_mean2d)
 
-    def _update(self, view: ViewGradients, stale: Collection[str]) -> Array:
+    def _update_parameters(self, view_gradients: ViewGradients, frozen: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  If there are no penalties, stale parameters, motion,
+        Returns the gradient of the projected means, [2, S] px⁻¹.  If there are no penalties, frozen parameters, motion,
         depths, or gradients of several views, a fused kernel updates the parameters without writing gradients to
         memory.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
-        step = view.comparison.step
+        step = view_gradients.comparison.step
         rates = self.rates.at(step, self.extent)
-        gaussians, has_depth = self.model.gaussians, view.frame.content == "inverse_depth"
+        gaussians, has_depth = self.model.gaussians, view_gradients.frame.content == "inverse_depth"
         has_several_views = self.views_per_update != 1
-        if not (penalties or stale or gaussians.is_moving or has_depth or has_several_views):
-            return self.adam.update(self.model, view.frame, view.pixel_sums, rates, self.rows)
-        gradients = self.rasterizer.gradients(self.model, view.frame, view.pixel_sums)
+        if not (penalties or frozen or gaussians.is_moving or has_depth or has_several_views):
+            return self.adam.update(self.model, view_gradients.frame, view_gradients.pixel_sums, rates, self.rows)
+        gradients = self.rasterizer.gradients(self.model, view_gradients.frame, view_gradients.pixel_sums)
         is_deferred = self.rows == "deferred" or gaussians.on_host
-        view_gradients = gradients.without_deferred() if is_deferred else gradients
-        inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, view_gradients, self.extent, step)
+        penalty_gradients = gradients.without_deferred() if is_deferred else gradients
+        inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, penalty_gradients, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
-        view.losses.extend(require_loss_value(penalty, penalty.add(inputs)) for penalty in penalties)
+        view_gradients.losses.extend(require_loss_value(penalty, penalty.add(inputs)) for penalty in penalties)
         if has_several_views:
             attach_gradients(gaussians)
             gradients = add_gradients(gaussians, gradients)
             if step % int(at_step(self.views_per_update, step)):
                 return gradients.mean2d
             gaussians[VIEWS].fill(0)
-        self.adam.step(self.model, view.frame, gradients, rates, stale, self.rows)
+        self.adam.step(self.model, view_gradients.frame, gradients, rates, frozen, self.rows)
         return gradients.mean2d

@@ -185,7 +185,7 @@ def test_device_is_a_name_or_an_open_device(device, rng, tiny_scene, tmp_path):
 def test_open_device_of_another_schedule_is_refused(function, device, tiny_scene):
     arguments = {"Trainer": (tiny_scene, "smoke"), "describe_run": ("smoke", tiny_scene)}[function.__name__]
     other = "simt" if device.schedule == "wide" else "wide"
-    with pytest.raises(ConfigError, match=f"the settings need the schedule {other}"):
+    with pytest.raises(ConfigError, match=f"the settings need {other}"):
         function(*arguments, device=device, set={"rasterizer.schedule": other})
 
 

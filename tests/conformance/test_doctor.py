@@ -115,12 +115,12 @@ def test_worker_gets_time_to_exit(monkeypatch, info, end, fault):
 def test_device_that_cannot_open_for_lack_of_memory_is_reported(monkeypatch, info):
     script = (
         "import sys; from clsplat.conformance import worker; from clsplat.core.errors import MemoryLimitError\n"
-        "def refuse(*_): raise MemoryLimitError('opening it: no memory')\n"
+        "def refuse(*_): raise MemoryLimitError('opening the device: no memory')\n"
         "worker.Device = refuse; worker.main(int(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:4], sys.argv[4:])"
     )
     monkeypatch.setattr(supervision, "WORKER", ("-c", script))
     results = list(run_checks(info, "simt", [BY_NAME["scans"], BY_NAME["rendering"]]))
-    assert [(item.fault, item.out_of_memory) for item in results] == [("opening it: no memory", True)] * 2
+    assert [(item.fault, item.out_of_memory) for item in results] == [("opening the device: no memory", True)] * 2
 
 
 def test_fault_that_empty_caches_fix_is_a_damaged_cache(monkeypatch, info):

@@ -10,7 +10,7 @@ from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS, SPEED
 from clsplat.core.resources import resource_dir
 from clsplat.opencl import device as program
 from clsplat.opencl.device import Device, parse_kernels
-from clsplat.opencl.discovery import choose
+from clsplat.opencl.discovery import choose_device
 from tests.support.devices import NAMES
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("cache_references")]  # most programs are built anew
@@ -323,7 +323,7 @@ def test_planted_fault_is_caught(monkeypatch, planted):
 
     monkeypatch.setattr(program, "flatten", with_the_fault)
     kernel, schedule = kernel_of(planted)
-    device = Device(choose(NAMES[0] or None), schedule or "auto")
+    device = Device(choose_device(NAMES[0] or None), schedule or "auto")
     for command, checks in CHECKS.items():
         if kernel in checked_by(checks) and not (planted in OPTIONAL and command == "a run"):
             assert first_failure(device, planted, checks), f"{command} does not notice a fault in {kernel}"

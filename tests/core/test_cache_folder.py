@@ -22,7 +22,7 @@ from clsplat.core.errors import OutputError
 from clsplat.core.machine import cache_folder
 from clsplat.opencl import runtimes
 from clsplat.opencl.device import Device
-from clsplat.opencl.kernel_caches import kernel_cache_advice, kernel_caches, remove_cut_kernels, require_space
+from clsplat.opencl.kernel_caches import kernel_cache_advice, kernel_caches, remove_broken_kernels, require_space
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the folders of Linux")
 
@@ -37,10 +37,10 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         monkeypatch.setenv(name, "")  # so that what the test sets is taken back
         monkeypatch.delenv(name)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    for once in (cache_folder, remove_cut_kernels):
+    for once in (cache_folder, remove_broken_kernels):
         once.cache_clear()
     yield tmp_path
-    for once in (cache_folder, remove_cut_kernels):
+    for once in (cache_folder, remove_broken_kernels):
         once.cache_clear()
 
 
@@ -211,14 +211,14 @@ def test_only_truncated_kernels_are_removed(machine, caplog):
     for name, data in {"scan": bytes(50), "invoker": database, "head": database[:50], "new": b""}.items():
         (pytools / f"pdict-v5-pyopencl-{name}-cache.sqlite").write_bytes(data)
     (pytools / "pdict-v5-another.sqlite").write_bytes(b"of others")
-    remove_cut_kernels()
+    remove_broken_kernels()
     left = {file.relative_to(pocl).as_posix() for file in pocl.rglob("*") if file.is_file()}
     cut = {kernel("kcache", name) for name in ("empty", "head", "table", "zeros")}
     assert files.keys() - left == {*cut, kernel("", "empty")}
     assert {file.name.split("-")[-2] for file in pytools.iterdir()} == {"invoker", "new", "v5"}
     (record,) = caplog.records
     assert record.getMessage().startswith("removed 7 truncated files from the kernel cache (")
-    remove_cut_kernels()
+    remove_broken_kernels()
     assert len(caplog.records) == 1
 
 
@@ -233,8 +233,8 @@ def test_kernels_are_examined_once_after_each_boot(machine, monkeypatch):
         """Return whether a new process finds a truncated kernel."""
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()
-        remove_cut_kernels.cache_clear()
-        remove_cut_kernels()
+        remove_broken_kernels.cache_clear()
+        remove_broken_kernels()
         return not file.exists()
 
     monkeypatch.setenv("POCL_CACHE_DIR", str(machine / "first"))
@@ -265,7 +265,7 @@ def test_truncated_database_is_removed_unless_being_written(page, machine):
         (pytools / f"pdict-v5-pyopencl-{name}.sqlite-{name}").write_bytes(b"of a writer")
     old = data[:92] + bytes(8) + data[100:page]  # by a writer that keeps no count
     (pytools / "pdict-v5-pyopencl-old.sqlite").write_bytes(old)
-    remove_cut_kernels()
+    remove_broken_kernels()
     left = {file.stem.split("-")[-1] for file in pytools.glob("*.sqlite")}
     assert left == {"whole", "journal", "wal", "old"}
 

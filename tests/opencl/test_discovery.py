@@ -21,7 +21,7 @@ from clsplat.core.errors import DeviceError, KernelError, MemoryLimitError
 from clsplat.opencl import device as program
 from clsplat.opencl import discovery, probe, runtimes
 from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import DeviceInfo, choose
+from clsplat.opencl.discovery import DeviceInfo, choose_device
 from clsplat.opencl.kernel_caches import kernel_caches
 from clsplat.render.rasterizer import Rasterizer
 
@@ -57,20 +57,20 @@ def set_devices(monkeypatch):
 )
 def test_strongest_gpu_or_first_cpu_is_chosen(set_devices, devices, first):
     set_devices(*devices)
-    assert choose() is first
+    assert choose_device() is first
 
 
 def test_other_gpus_are_named_in_one_line(set_devices, caplog):
     set_devices(CPU, INTEGRATED, LARGE, LARGER)
     with caplog.at_level(logging.INFO, "clsplat"):
-        choose()
+        choose_device()
     assert [record.message for record in caplog.records] == [
         "using Larger (GPU) on Runtime A; other GPUs: Small (GPU) on Runtime A; Large (GPU) on Runtime A; "
         "select one with --device NAME"
     ]
     caplog.clear()
     set_devices(CPU, LARGE)
-    choose()
+    choose_device()
     assert not caplog.records
 
 
@@ -81,7 +81,7 @@ def test_device_with_small_groups_does_not_work(set_devices, info, least):
     assert small.fault() == f"its work-groups have at most {least - 1} items; {least} are needed"
     set_devices(small)
     with pytest.raises(DeviceError, match="work-groups have at most"):
-        choose()
+        choose_device()
 
 
 def test_damaged_cache_is_reported_as_the_cause(monkeypatch, tmp_path):
@@ -134,7 +134,7 @@ def test_kernels_without_vector_units_are_not_built(monkeypatch, width, lanes):
     for name in ("Context", "CommandQueue", "Buffer"):
         monkeypatch.setattr(probe.cl, name, lambda *_, **__: None)
     monkeypatch.setattr(probe.cl, "Program", Program)
-    with pytest.raises(SystemExit, match="error: kernels are compiled without the vectors of the processor"):
+    with pytest.raises(SystemExit, match="error: kernels are compiled without the processor's vector instructions"):
         probe.main(0, 0)
     assert f"vload{lanes}(" in built[0]
 
@@ -177,7 +177,7 @@ class Platform:
 
 def test_broken_runtime_is_reported_and_isolated(monkeypatch, info, caplog):
     platform, number = info.index
-    good = discovery.platforms()[platform]
+    good = discovery.get_platforms()[platform]
     devices = [BrokenDevice(), good.get_devices()[number]]
     runtimes_found = [
         Platform(refusal(cl.status_code.DEVICE_NOT_FOUND)),
@@ -216,7 +216,7 @@ def test_probe_result_is_valid_for_its_kernels_only(monkeypatch, tmp_path):
 
 @pytest.fixture
 def info() -> DeviceInfo:
-    return choose()
+    return choose_device()
 
 
 def capped(monkeypatch: pytest.MonkeyPatch, items: int, *kernels: str) -> None:
@@ -336,7 +336,7 @@ def test_memory_limit_is_named_if_no_device_works(monkeypatch):
         discovery.list_devices()
     monkeypatch.setattr(discovery, "list_devices", list)
     with pytest.raises(MemoryLimitError, match="no OpenCL device was found; a process may use only 683 MiB"):
-        discovery.choose()
+        discovery.choose_device()
 
 
 @pytest.mark.parametrize("name", ["POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES"])
@@ -346,7 +346,7 @@ def test_variable_that_hides_all_devices_is_named(monkeypatch, name):
         monkeypatch.delenv(other, raising=False)
     monkeypatch.setenv(name, "wrong")
     with pytest.raises(DeviceError, match=f"^no OpenCL device was found; {name}='wrong' may hide .*; or install a"):
-        discovery.choose()
+        discovery.choose_device()
     monkeypatch.setenv(name, str(runtimes.cache_folder() / "drivers" / "x"))  # as `prepare` sets it
     with pytest.raises(DeviceError, match=r"^no OpenCL device was found; install a runtime"):
-        discovery.choose()
+        discovery.choose_device()

@@ -72,7 +72,7 @@ def test_sky_gradient_matches_the_losses(device, rng, share):
     view = scene.trainer.compare(scene.photograph, 1)
     view = scene.trainer.backward(view)
     skies, sky = scene.trainer.rasterizer.skies, scene.model.sky
-    shown = skies.runs(scene.photograph.camera, 8).shown.get()
+    shown = skies.runs(scene.photograph.camera, 8).texels.get()
     result = scene.trainer.rasterizer.workspace.array("texels", (3, len(shown))).get()
     places = [(int(np.abs(result[channel]).argmax()), channel) for channel in range(3)]
     for place, channel in places:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from clsplat.opencl.device import Device, Program, parse_kernels
-from clsplat.opencl.discovery import choose
+from clsplat.opencl.discovery import choose_device
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "cl_kernels").glob("*.[ch]*"))
@@ -114,8 +114,8 @@ def test_includes_are_local():
 
 def test_every_define_from_the_host_is_declared_in_common():
     declared = set(re.findall(r"#ifndef (\w+)\n#define \1", (ROOT / "cl_kernels" / "common.h").read_text()))
-    device = Device(choose())
-    simt = Device(choose(), "simt")
+    device = Device(choose_device())
+    simt = Device(choose_device(), "simt")
     assert set(device.tuning) | set(simt.tuning) <= declared
 
 
@@ -129,7 +129,7 @@ def test_every_kernel_is_called():
 @pytest.mark.parametrize("lanes", [16, 8, 1])
 def test_every_file_builds_alone(lanes):
     schedule = "simt" if lanes == 1 else "wide"
-    device = Device(choose(), schedule)
+    device = Device(choose_device(), schedule)
     device.tuning["LANES"] = lanes
     faults = []
     for path in KERNEL_FILES:

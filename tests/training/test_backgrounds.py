@@ -5,7 +5,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import choose
+from clsplat.opencl.discovery import choose_device
 from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
@@ -20,14 +20,14 @@ RANDOM = "optimize.modules.random_background={}"
 
 
 def test_colors_depend_only_on_seed_and_step():
-    device = Device(choose())
+    device = Device(choose_device())
     drawn = [tuple(random_color(device, seed, step).get()) for seed, step in ((0, 1), (0, 2), (1, 1), (0, 1))]
     assert len(set(drawn)) == 3
     assert drawn[0] == drawn[3]
 
 
 def test_transparent_pixels_get_the_drawn_color(tiny_scene):
-    device, scene = Device(choose()), read_scene(tiny_scene)
+    device, scene = Device(choose_device()), read_scene(tiny_scene)
     photographs, view = Photographs(device, "white"), scene.split("train")[0]
     behind = random_color(device, 0, 3)
     height, width = view.camera.height, view.camera.width

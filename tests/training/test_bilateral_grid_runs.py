@@ -123,8 +123,8 @@ def bits(device: Device) -> str:
 
 @pytest.mark.slow
 def test_one_core_gives_the_same_bits(info):
-    code = f"from {__name__} import Device, bits\nfrom clsplat.opencl.discovery import choose\n"
-    code += f"print(bits(Device(choose({info.name!r}))))"
+    code = f"from {__name__} import Device, bits\nfrom clsplat.opencl.discovery import choose_device\n"
+    code += f"print(bits(Device(choose_device({info.name!r}))))"
     command, own = [sys.executable, "-c", code], {**os.environ, **ONE_CORE}
     done = subprocess.run(command, check=True, env=own, capture_output=True, text=True)
     assert done.stdout.split()[-1] == bits(Device(info))

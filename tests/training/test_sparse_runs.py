@@ -9,7 +9,7 @@ from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.gaussians.gaussians import DropoutMask
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import choose
+from clsplat.opencl.discovery import choose_device
 from clsplat.pipeline.loading import load
 from clsplat.render.rasterizer import Rasterizer
 from tests.support.runs import digest, train
@@ -52,7 +52,7 @@ def test_dropout_changes_the_bits(tiny_scene, tmp_path, pipeline):
 
 
 def test_dropped_gaussian_counts_as_invisible(rng):
-    device = Device(choose())
+    device = Device(choose_device())
     case = random_case(rng, 40)
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device)
     model.dropout = DropoutMask(0.5, 1, 2)

@@ -143,7 +143,7 @@ def test_rates_and_weights_use_the_global_step(any_device, rng, step, expected):
 def test_stale_parameters_do_not_change(any_device, rng):
     trainer, photograph = trainer_of(any_device, rng, [L1(), Anisotropy(above=1.0)])
     before = {name: trainer.model.gaussians.get(name) for name in ("logit_opacity", "log_scales")}
-    view = trainer.step(photograph, 1, stale=["logit_opacity"])
+    view = trainer.step(photograph, 1, frozen=["logit_opacity"])
     assert [loss.name for loss in view.losses] == ["l1", "anisotropy"]
     np.testing.assert_array_equal(trainer.model.gaussians.get("logit_opacity"), before["logit_opacity"])
     assert (trainer.model.gaussians.get("log_scales") != before["log_scales"]).any()

@@ -175,16 +175,16 @@ class BenchCase:
         self.frame: Frame | None = None
         for _ in range(WARM_UP_STEPS):
             self.step(record=False)
-        self.step(record=False, stale=PARAMETERS)  # writes gradients to memory, as a step with an edit does
+        self.step(record=False, frozen=PARAMETERS)  # writes gradients to memory, as a step with an edit does
         self.edit()
         self.memory = device.peak - self._initial_bytes
 
-    def step(self, record: bool, stale: Collection[str] = ()) -> None:
-        """Run one training step.  record: whether to record times; stale: parameters that are not updated."""
+    def step(self, record: bool, frozen: Collection[str] = ()) -> None:
+        """Run one training step.  record: whether to record times; frozen: parameters that are not updated."""
         self.device.finish()
         self.device.timings.sampling = record
         start = time.perf_counter()
-        view = self.trainer.step(self.photograph, 1, stale=stale)
+        view = self.trainer.step(self.photograph, 1, frozen=frozen)
         self.device.finish()
         seconds = time.perf_counter() - start
         self.device.timings.sampling = False

@@ -28,7 +28,7 @@ from clsplat.density.survey import BLENDED, SQUARE, WEIGHT
 from clsplat.losses.depth import InverseDepth
 from clsplat.opencl.device import Device
 from clsplat.photos.depths import KnownDepths
-from clsplat.render.overlay import lay_over, look_behind
+from clsplat.render.overlay import backpropagate_composite, composite_layer
 from clsplat.render.rasterizer import INVERSE_DEPTHS, PIXEL_SUMS, RECORD, Frame, Rasterizer, RenderLimits
 from clsplat.render.tiles import Sort
 from clsplat.render.workspace import Workspace
@@ -166,7 +166,7 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
         planes = np.zeros((4, camera.rows, camera.stride), np.float32)
         planes[:, :height, :width] = rng.normal(size=(4, height, width))
         behind = device.upload(planes[3] * np.abs(frame.transmittance.get()))
-        sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), behind=behind)
+        sums = rasterizer.pixel_sums(model, frame, device.upload(planes[:3]), transmittance_gradient=behind)
         splats, weights = case.project(), planes[:, :height, :width].astype(np.float64)
         image_gradients = ref.blend_backward(splats, width, height, BACKGROUND.astype(np.float64), weights[:3])
         black, channel = replace(splats, color=0 * splats.color), np.stack([weights[3], *np.zeros((2, height, width))])
@@ -340,8 +340,8 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
         "transmittance": to_planes(device, camera, signed_transmittance[None]),
     }
     frame, label, scale = cast(Any, SimpleNamespace(camera=camera, **planes)), f"{width} x {height} px", 0.01
-    actual = lay_over(workspace, frame, to_planes(device, camera, image), scale)
-    composite, behind = actual.image.get(), actual.behind.get()
+    actual = composite_layer(workspace, frame, to_planes(device, camera, image), scale)
+    composite, behind = actual.image.get(), actual.transmittance_gradient.get()
     inside = np.s_[..., :height, :width]
     exact = transmittance.astype(np.float64)
     yield compare_max("lay_over", f"sum, {label}", composite[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
@@ -351,7 +351,7 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
     for output in (composite, behind):
         yield match("lay_over", f"pixels outside the image, {label}", blank_image(camera, output), 0.0)
     actual_gradient = to_planes(device, camera, gradient)
-    look_behind(workspace, frame, actual_gradient)
+    backpropagate_composite(workspace, frame, actual_gradient)
     expected = ref.gradient_behind(exact, gradient)
     yield compare_max("look_behind", f"derivatives, {label}", actual_gradient.get()[inside], expected, 1e-6, floor=1.0)
 

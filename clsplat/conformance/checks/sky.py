@@ -70,7 +70,7 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
     grad_texels = view.skies.grad_texels(view.sky, view.camera, view.transmittance, view.planes(gradient))
     transmittance = view.magnitude.astype(np.float64)
     expected = ref.sky_gradient(side, view.directions, transmittance, gradient.astype(np.float64)).reshape(-1, 3)
-    visible = view.skies.runs(view.camera, side).shown.get()
+    visible = view.skies.runs(view.camera, side).texels.get()
     yield compare("sky_backward", f"derivatives, {label}", grad_texels.get().T, expected[visible], SUM)
     yield compare("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, expected[visible], SUM)
     yield match("sky_gather", f"texels outside the view, {label}", np.delete(expected, visible, axis=0), 0.0)
@@ -83,7 +83,7 @@ def check_cover(device: Device, rng: np.random.Generator, width: int, height: in
     distance = np.where(rng.random((height, width)) < 0.3, 2.0, 0.4) * difference
     photograph = (sky + distance * np.where(rng.random(sky.shape) < 0.5, -1, 1)).astype(np.float32)
     scale = weight / (width * height)
-    behind, sums = view.skies.cover(
+    behind, sums = view.skies.coverage_loss(
         view.sky, view.free, view.camera, view.planes(photograph), view.transmittance, difference, scale
     )
     has_fixed_texel = ref.sky_image(1.0 - view.free_mask[..., None], view.directions)[0] > 0
@@ -114,7 +114,7 @@ def adam_of_the_sky(device: Device, rng: np.random.Generator) -> Results:
     """Compare three Adam updates, and check that texels outside the view do not change."""
     side = 16
     view, texels = SkyView(device, rng, 9, 7, side), side**2
-    visible = view.skies.runs(view.camera, side).shown.get()
+    visible = view.skies.runs(view.camera, side).texels.get()
     moments = {name: device.zeros((width, texels)) for name, width in (("moment1", 3), ("moment2", 3), ("biases", 2))}
     moments["free"], is_free = view.free, view.free_mask.ravel()[visible]
     expected = flatten_map(view.texels)[:, visible].astype(np.float64)

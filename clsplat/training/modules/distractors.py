@@ -20,7 +20,7 @@ from clsplat.gaussians.structs import moment_tables
 from clsplat.losses.base import LossValue
 from clsplat.opencl.device import Device
 from clsplat.render.camera import move_camera
-from clsplat.render.overlay import lay_over, look_behind
+from clsplat.render.overlay import backpropagate_composite, composite_layer
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.view import View
 from clsplat.training.adam import Adam, Rates
@@ -111,7 +111,7 @@ class DistractorsState(ModuleState):
         model = replace(step.model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
         frame = self.rasterizer.forward(model, move_camera(camera, np.eye(3, 4)), self._black)
         scale = at_step(self.settings.cover, step.number) / (camera.width * camera.height)
-        layer = lay_over(step.workspace, frame, step.image, scale)
+        layer = composite_layer(step.workspace, frame, step.image, scale)
         step.image = layer.image
         step.module_losses.append(LossValue("distractors", layer.loss))
         step.save(self, (layer, []))
@@ -121,8 +121,9 @@ class DistractorsState(ModuleState):
             return
         layer, sums = saved
         frame = replace(layer.frame, image=layer.image)  # the gradient of blending needs the combined colors
-        sums += [frame, self.rasterizer.pixel_sums(frame.model, frame, step.gradient, behind=layer.behind)]
-        look_behind(step.workspace, frame, step.gradient)
+        arguments = frame.model, frame, step.gradient
+        sums += [frame, self.rasterizer.pixel_sums(*arguments, transmittance_gradient=layer.transmittance_gradient)]
+        backpropagate_composite(step.workspace, frame, step.gradient)
 
     def update(self, step: TrainingStep) -> None:
         if (saved := step.saved_value(self)) and step.view is not None:

@@ -84,7 +84,7 @@ class LearnedSky(ModuleState):
             return
         scale = weight / (camera.width * camera.height)
         difference = at_step(self.settings.difference, step.number)
-        step.transmittance_gradient, sums = step.rasterizer.skies.cover(
+        step.transmittance_gradient, sums = step.rasterizer.skies.coverage_loss(
             self.sky, self._arrays[FREE], camera, comparison.photograph, step.frame.transmittance, difference, scale
         )
         if comparison.mask is not None:
