@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.files import PIPELINE, remove_partial_files, write_text
-from clsplat.core.progress import Count
+from clsplat.core.progress import ItemCounter
 from clsplat.core.reading import read_json, sha256
 from clsplat.scene.images import image_size, is_image, write_image
 from clsplat.scene.quality import SIDE, sharpness
@@ -39,7 +39,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     Raises DataError if the video cannot be decoded or has only one frame, or if `out` contains other images.
     """
     settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
-    remove_partial_files(out, border=PIPELINE)
+    remove_partial_files(out, marker=PIPELINE)
     frame_indices = _read_chosen_frames(out, settings)
     if frame_indices is None:
         LOG.info("%s: looking for sharp frames", video)
@@ -50,13 +50,13 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
         LOG.info("%d frames, of which %d are written", len(sharpnesses), len(frame_indices))
         write_text(out / RECORD, json.dumps({**settings, "chosen": frame_indices}) + "\n")
     files = {index: _file(out, i) for i, index in enumerate(frame_indices, 1)}
-    count = Count("frames written", len(files))
+    counter = ItemCounter("frames written", len(files))
     missing = {index for index, path in files.items() if not _is_readable(path)}
     for index, image in enumerate(decode_frames(video) if missing else ()):
         if index in missing:
             write_image(files[index], np.ascontiguousarray(limit_size(image, long_side)[:, :, ::-1]))
             missing.remove(index)
-            count.reach(count.done + 1)
+            counter.reach(counter.done + 1)
     if missing:
         raise DataError(f"{out / RECORD}: lists frame {min(missing)}, which is not in the video; remove {out}")
     if times:

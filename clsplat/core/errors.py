@@ -15,7 +15,7 @@ from itertools import islice
 
 MESSAGE_LIMIT = 1000  # characters
 QUOTE_LIMIT = 80  # characters of a value in a message
-NAMES_SHOWN = 8  # names of a list in a message
+MAX_NAMES = 8  # of a list in a message
 PLUGIN_MARK = "__clsplat_plugin__"  # module variable that marks plug-in code
 
 
@@ -106,7 +106,7 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
     if isinstance(error, ClsplatError):
         return error
     if isinstance(error, KeyboardInterrupt):
-        return Interrupted("stopped at once; to continue, run it again, with --resume if a checkpoint was saved")
+        return Interrupted("stopped at once; to continue, repeat the command, with --resume if a checkpoint was saved")
     if isinstance(error, MemoryError):
         return MemoryLimitError("out of memory; use fewer Gaussians, or fewer or smaller images (scene.downscale)")
     if isinstance(error, ImportError) and "failed to map segment" in str(error):
@@ -137,9 +137,9 @@ def one_line(error: BaseException | str) -> str:
 
 
 def first_few(names: Sequence[str]) -> str:
-    """Join up to NAMES_SHOWN names of a list for a message, and append how many more there are."""
-    more = f", and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
-    return ", ".join(names[:NAMES_SHOWN]) + more
+    """Join up to MAX_NAMES names of a list for a message, and append how many more there are."""
+    more = f", and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+    return ", ".join(names[:MAX_NAMES]) + more
 
 
 def pluralize(count: int, word: str) -> str:
@@ -148,7 +148,7 @@ def pluralize(count: int, word: str) -> str:
 
 
 def size_text(gaussians: int | None, parameters: int | None, sky: int = 0) -> str:
-    """Format the size of a trained model: the numbers of scene and `sky` Gaussians, or of a field's parameters."""
+    """Format the size of a trained model: the number of Gaussians and `sky` Gaussians, or of a field's parameters."""
     text = f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
     return f"{text} and {sky:,} of the sky" if sky else text
 

@@ -68,7 +68,8 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """Yield a hidden folder next to `folder`, and rename it to `folder` when the block ends without an error.
 
     Hidden folders left by killed processes are removed first.  The caller must sync the files.
-    Raises ConfigError when `folder` is in use, and OutputError, possibly before the block, when it cannot be created.
+    Raises ConfigError when `folder` exists and is not empty, and OutputError, possibly before the block, when it cannot
+    be created.
     """
     require_free(folder)
     with scratch_folder(folder) as temporary:
@@ -187,10 +188,10 @@ def _sync(path: Path, flags: int) -> None:
             raise
 
 
-def remove_partial_files(folder: Path, border: str) -> None:
-    """Remove temporary files of killed processes below a folder, except in subfolders with a file named `border`."""
+def remove_partial_files(folder: Path, marker: str) -> None:
+    """Remove temporary files of killed processes below a folder, except in subfolders with a file named `marker`."""
     for base, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not os.path.exists(os.path.join(base, name, border))]
+        folders[:] = [name for name in folders if not os.path.exists(os.path.join(base, name, marker))]
         for name in filter(_is_abandoned, files):
             with suppress(OSError):
                 os.unlink(os.path.join(base, name))
@@ -312,8 +313,8 @@ def check_result_path(path: Path, suffix: str) -> None:
 def check_not_run_file(path: Path) -> None:
     """Raise ConfigError if a command would overwrite a file of a run."""
     folders = path.absolute().parents
-    run = next((folder for folder in folders if any((folder / n).is_file() for n in (CHECKSUMS, STATUS))), None)
-    if run and path_exists(path) and _is_run_file(run, path):
+    run_folder = next((folder for folder in folders if any((folder / n).is_file() for n in (CHECKSUMS, STATUS))), None)
+    if run_folder and path_exists(path) and _is_run_file(run_folder, path):
         raise ConfigError(f"{path}: is a file of a run; use another name")
 
 

@@ -32,7 +32,7 @@ def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean of the basis functions Y(d), [K], over a distribution of directions d.
 
     `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  Products of two functions of bands 1 to 3 span all of
-    these functions.  Products of band 1 alone do not, so the result is then 0.
+    these functions.  Products of only band 1 do not, so the result is then 0.
     """
     count, directions = len(form), _directions()
     values = basis(np.concatenate([directions, -directions]))[:, :count]

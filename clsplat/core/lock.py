@@ -60,7 +60,7 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
     heartbeat = _heartbeat(path)
     if heartbeat is not None and (age := time.time() - heartbeat) < HEARTBEAT_TIMEOUT:
         raise OutputError(
-            f"{in_use_message(folder, owner)}; its heartbeat is {max(0, age):.0f} s old, but the lock is free here; "
+            f"{in_use_message(folder, owner)}; its heartbeat is {max(0, age):.0f} s old; "
             f"if that process has exited, wait a minute or remove {path}"
         )
     return owner
@@ -70,7 +70,7 @@ def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[
     """Wait until the owner's heartbeat is stale, and return the same as `require_stale_heartbeat`.
 
     A heartbeat is recognized by a change, not by its time, because the clocks of two machines may differ.
-    Raises OutputError if there is one.
+    Raises OutputError if the heartbeat changes.
     """
     heartbeat, deadline, is_logged = _heartbeat(path), time.monotonic() + HEARTBEAT_TIMEOUT, False
     while True:
@@ -107,14 +107,14 @@ def lost_lock_message(path: Path, folder: Path) -> str:
         holder = ""
     return (
         f"{folder}: {path.name} was removed or replaced while this process held it{holder}; nothing more was written; "
-        "resume the run when no other process uses it"
+        "resume the run when no other process uses the folder"
     )
 
 
 def in_use_message(folder: Path, owner: dict[str, Any]) -> str:
     """Return the message about a folder that another process uses."""
     if not owner:
-        return f"{folder}: is in use by another process"
+        return f"{folder}: is in use by another process; wait for it, or use another folder"
     try:
         since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(float(owner.get("time", 0))))
     except (TypeError, ValueError, OverflowError, OSError):

@@ -247,7 +247,7 @@ def _is_alive_on_windows(kernel: Any, process: int) -> bool:
     return not succeeded or code.value == STILL_ACTIVE
 
 
-# Free memory.
+# Limits of a process, and free memory.
 
 
 def process_limit(name: Literal["RLIMIT_AS", "RLIMIT_FSIZE"]) -> int | None:

@@ -12,7 +12,7 @@ RECORD = ".manifest.jsonl"
 
 
 class Manifest:
-    """The record of a folder, with one line per file that a tool wrote and a hash of its sources.
+    """The record of a folder: one line per file that a tool wrote, with a hash of the file's sources.
 
     A file is written atomically after its line is on disk, and an outdated file is removed before its new line is
     written.  So every file that exists is complete and was made from the sources in its last line.  Temporary files of
@@ -20,9 +20,9 @@ class Manifest:
     """
 
     def __init__(self, folder: Path) -> None:
-        remove_partial_files(folder, border=PIPELINE)
+        remove_partial_files(folder, marker=PIPELINE)
         self.folder, self._sources = folder, dict[str, str]()
-        for line in _lines(folder / RECORD):
+        for line in _read_lines(folder / RECORD):
             try:
                 entry = json.loads(line)
                 self._sources[str(entry["file"])] = str(entry["from"])
@@ -47,7 +47,7 @@ class Manifest:
                 file.unlink(missing_ok=True)
             if self._sources.get(name) != source:
                 make_folder(self.folder)
-                line = "\n" + json.dumps({"file": name, "from": source})  # on a new line, after an incomplete one too
+                line = "\n" + json.dumps({"file": name, "from": source})  # the last line may be incomplete
                 append(self.folder / RECORD, line.encode())
         except OSError as error:
             raise write_error(path, error) from error
@@ -72,7 +72,7 @@ def hash_values(*values: object) -> str:
     return state.hexdigest()
 
 
-def _lines(path: Path) -> list[str]:
+def _read_lines(path: Path) -> list[str]:
     try:
         return read_file(path).decode(errors="replace").splitlines()
     except DataError:

@@ -43,7 +43,7 @@ def require_complete(path: Path) -> None:
         raise DataError(f"{path}: is truncated; create the page again")
 
 
-def safe_charts(drawings: Iterable[str]) -> list[Markup]:
+def mark_charts_safe(drawings: Iterable[str]) -> list[Markup]:
     """Mark SVG drawings as safe for templates, and drop empty ones."""
     return [_mark_safe(drawing) for drawing in drawings if drawing]
 
@@ -84,10 +84,10 @@ def data_url(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
     return f"data:image/{subtype};base64,{base64.b64encode(data.tobytes()).decode()}"
 
 
-def shrink(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
-    """Downscale an image so that its longer side is at most `longest` px."""
+def downscale(image: NDArray[np.uint8], max_side: int) -> NDArray[np.uint8]:
+    """Downscale an image so that its longer side is at most `max_side` px."""
     height, width = image.shape[:2]
-    factor = longest / max(width, height)
+    factor = max_side / max(width, height)
     if factor >= 1:
         return image
     size = max(1, round(width * factor)), max(1, round(height * factor))
@@ -99,7 +99,7 @@ def shrink(image: NDArray[np.uint8], longest: int) -> NDArray[np.uint8]:
 THUMBNAIL = 160  # px, the longer side
 
 
-def summary(rows: Mapping[str, str], images: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> str:
+def render_summary(rows: Mapping[str, str], images: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> str:
     """Return an HTML fragment with a table of names and values, and with named RGB images, [height, width, 3]."""
-    thumbnails = [(name, data_url(shrink(image, THUMBNAIL))) for name, image in images]
+    thumbnails = [(name, data_url(downscale(image, THUMBNAIL))) for name, image in images]
     return render("notebook.html.j2", rows=rows, thumbnails=thumbnails)

@@ -77,7 +77,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 
 @contextmanager
-def counts_as_debug() -> Iterator[None]:
+def logging_counts_as_debug() -> Iterator[None]:
     """Log the block's counts at debug level, because the caller shows them in another way."""
     token = _level.set(logging.DEBUG)
     try:
@@ -86,12 +86,12 @@ def counts_as_debug() -> Iterator[None]:
         _level.reset(token)
 
 
-class Count:
+class ItemCounter:
     """A counter of finished items; `label` describes them, such as 'photographs decoded'."""
 
-    def __init__(self, label: str, total: int, is_even: bool = True) -> None:
-        """is_even: whether all items take about the same time, so that the remaining time can be estimated."""
-        self.label, self.total, self.done, self.is_even = label, total, 0, is_even
+    def __init__(self, label: str, total: int, is_uniform: bool = True) -> None:
+        """is_uniform: whether all items take about the same time, so that the remaining time can be estimated."""
+        self.label, self.total, self.done, self.is_uniform = label, total, 0, is_uniform
         self._start: tuple[float, int] | None = None  # time of the first report, and number of items then done
         self._logged = time.monotonic()
         self.reach(0)
@@ -99,7 +99,7 @@ class Count:
     @property
     def seconds_left(self) -> float | None:
         """The estimated time for the remaining items; None before the first is done."""
-        if not self.is_even or self._start is None or self.done <= self._start[1]:
+        if not self.is_uniform or self._start is None or self.done <= self._start[1]:
             return None
         start, start_count = self._start
         return (time.monotonic() - start) / (self.done - start_count) * (self.total - self.done)
@@ -116,20 +116,20 @@ class Count:
             listener(self.label, done, self.total, seconds_left=seconds_left)
         if done and time.monotonic() - self._logged >= INTERVAL:
             self._logged = time.monotonic()
-            remaining = f", {clock(seconds_left)} left" if seconds_left else ""
+            remaining = f", {clock_text(seconds_left)} left" if seconds_left else ""
             LOG.log(_level.get(), "%s: %d of %d%s", self.label, done, self.total, remaining)
 
 
 def counted(items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
     """Yield the items and count them.  An item is done when the next one is requested."""
-    count = Count(label, total)
+    counter = ItemCounter(label, total)
     for done, item in enumerate(items, 1):
         yield item
-        count.reach(done)
+        counter.reach(done)
 
 
 @contextmanager
-def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
+def polled(counter: ItemCounter, poll: Callable[[], int]) -> Iterator[None]:
     """Report the progress of the block from a thread that gets the number of finished items from `poll`."""
     stop, context = threading.Event(), contextvars.copy_context()
 
@@ -137,8 +137,8 @@ def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
         start = time.monotonic()
         while not stop.wait(min(max(MIN_POLL_INTERVAL, (time.monotonic() - start) / MAX_POLLS), MAX_POLL_INTERVAL)):
             done = poll()
-            if done > count.done:
-                count.reach(min(done, count.total))
+            if done > counter.done:
+                counter.reach(min(done, counter.total))
 
     thread = threading.Thread(target=context.run, args=(watch,), name="count", daemon=True)
     thread.start()
@@ -149,7 +149,7 @@ def polled(count: Count, poll: Callable[[], int]) -> Iterator[None]:
         thread.join()
 
 
-def clock(seconds: float) -> str:
+def clock_text(seconds: float) -> str:
     """Format a duration as h:mm:ss or m:ss."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
@@ -171,4 +171,4 @@ class Progress:
     gaussians: int | None  # None when training a field
     milliseconds: float  # per step
     seconds_left: float
-    growth_known: bool = True  # False: densification will slow steps by an unknown amount
+    is_growth_known: bool = True  # False: densification will slow steps by an unknown amount

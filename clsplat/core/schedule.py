@@ -164,7 +164,7 @@ def divide(schedule: Schedule, factor: float) -> Schedule:
 
 
 class Bounded:
-    """A validator that requires a schedule's values to be from `minimum`, or above it if `exclusive`, to `maximum`."""
+    """A validator that requires values of at least `minimum` (larger if `exclusive`) and at most `maximum`."""
 
     def __init__(self, minimum: float, exclusive: bool = False, maximum: float = math.inf) -> None:
         self.minimum, self.exclusive, self.maximum = minimum, exclusive, maximum

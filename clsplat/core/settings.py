@@ -65,7 +65,7 @@ class Settings(BaseModel):
     def check_pipeline(self, pipeline: Any) -> None:
         """Raise ConfigError if the pipeline (a PipelineFile) lacks something that these settings need."""
 
-    def parts(self) -> dict[str, Any]:
+    def active_values(self) -> dict[str, Any]:
         """Return the values by key, except values without effect."""
         return {key: getattr(self, key) for key in type(self).model_fields}
 
@@ -93,7 +93,7 @@ def iter_settings(value: Any, path: str = "") -> Iterator[tuple[str, Settings]]:
     elif isinstance(value, Settings):
         path = f"{path}.{name}" if (name := getattr(value, "stage", None)) else path
         yield path, value
-        for key, inner in value.parts().items():
+        for key, inner in value.active_values().items():
             yield from iter_settings(inner, f"{path}.{key}" if path else key)
 
 
@@ -204,7 +204,7 @@ class Variants:
 
 def _check_path(text: str) -> str:
     if "\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text):
-        raise ValueError("expected a path; it contains a character that is not allowed in file names")
+        raise ValueError("expected a path without NUL characters and with valid Unicode")
     return text
 
 

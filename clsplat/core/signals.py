@@ -134,13 +134,13 @@ class Stream:
     def __init__(self, name: str) -> None:
         self.name = name
         self.fault: OSError | ValueError | None = None
-        self._replaced: Any = None
+        self._original: Any = None
 
     @property
     def _raw(self) -> Any:
         stream = getattr(sys, self.name)
         stream = getattr(stream, "rich_proxied_file", stream)  # while a live line is shown
-        return self._replaced if stream is self else stream
+        return self._original if stream is self else stream
 
     @property
     def rich_proxied_file(self) -> "Stream":
@@ -182,7 +182,7 @@ class Stream:
             stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")  # for file names that are not valid text
-        self._replaced = stream
+        self._original = stream
         setattr(sys, self.name, self)
 
 
@@ -207,12 +207,12 @@ def check_output() -> None:
     if fault is None or _is_closed_by_reader(fault):
         return
     reason = getattr(fault, "strerror", None) or fault
-    raise OutputError(f"stdout: cannot be written ({reason}); redirect it elsewhere, or free space")
+    raise OutputError(f"stdout: cannot be written ({reason}); redirect it elsewhere, or free up space")
 
 
 def _is_closed_by_reader(fault: OSError | ValueError) -> bool:
-    windows = sys.platform == "win32" and getattr(fault, "errno", None) == errno.EINVAL
-    return isinstance(fault, BrokenPipeError) or windows
+    is_windows_pipe = sys.platform == "win32" and getattr(fault, "errno", None) == errno.EINVAL
+    return isinstance(fault, BrokenPipeError) or is_windows_pipe
 
 
 def _redirect_to_null(stream: Any) -> None:

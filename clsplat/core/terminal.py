@@ -18,7 +18,7 @@ from clsplat.core import signals
 from clsplat.core.errors import OutputError
 from clsplat.core.files import raising_output_error
 from clsplat.core.progress import Progress as TrainingProgress
-from clsplat.core.progress import clock, counts_as_debug, listening
+from clsplat.core.progress import clock_text, listening, logging_counts_as_debug
 from clsplat.core.resources import full_version
 
 LOG = logging.getLogger("clsplat")
@@ -42,11 +42,11 @@ class _TerminalHandler(logging.Handler):
         self.console = console
 
     def emit(self, record: logging.LogRecord) -> None:
-        warning = record.levelno >= logging.WARNING
-        console = ERRORS if warning else self.console
+        is_warning = record.levelno >= logging.WARNING
+        console = ERRORS if is_warning else self.console
         if _bars and console.is_terminal:  # a line on another console would run into the bar
             console = CONSOLE
-        console.print(("warning: " if warning else "") + record.getMessage(), markup=False)
+        console.print(("warning: " if is_warning else "") + record.getMessage(), markup=False)
 
 
 def start_logging(debug: bool, console: Console = CONSOLE) -> None:
@@ -87,11 +87,11 @@ class _LogFile(logging.FileHandler):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, encoding="utf-8", errors="backslashreplace")
-        self.failed = False
+        self.has_failed = False
 
     def handleError(self, record: logging.LogRecord) -> None:
-        if not self.failed:
-            self.failed = True
+        if not self.has_failed:
+            self.has_failed = True
             error = sys.exc_info()[1]
             reason = getattr(error, "strerror", None) or error
             LOG.warning("%s: cannot be written (%s); continuing without this log", self.baseFilename, reason)
@@ -136,11 +136,11 @@ def logging_to(path: Path) -> Iterator[None]:
 
 def progress_line(progress: TrainingProgress) -> str:
     """Format the progress at a step as one line."""
-    prefix = "" if progress.growth_known else "at least "
+    prefix = "" if progress.is_growth_known else "at least "
     count = "" if progress.gaussians is None else f"gaussians {progress.gaussians:,}  "
     return (
         f"step {progress.step}/{progress.steps}  loss {progress.loss:.4f}  psnr {progress.psnr:.1f}  {count}"
-        f"{progress.milliseconds:.1f} ms/step  {prefix}{clock(progress.seconds_left)} left"
+        f"{progress.milliseconds:.1f} ms/step  {prefix}{clock_text(progress.seconds_left)} left"
     )
 
 
@@ -178,7 +178,7 @@ def counts_on_terminal() -> Iterator[None]:
     task = bar.add_task("", total=None, visible=False)
 
     def update(label: str, done: int, total: int, /, *, seconds_left: float | None) -> None:
-        suffix = "" if seconds_left is None or done == total else f"  {clock(seconds_left)} left"
+        suffix = "" if seconds_left is None or done == total else f"  {clock_text(seconds_left)} left"
         bar.update(task, total=total, completed=done, description=f"{label}: {done} of {total}{suffix}", visible=True)
 
     with _draw(bar), listening(update):
@@ -191,36 +191,36 @@ class _RunBar:
     def __init__(self, status: StatusSource) -> None:
         self.status, self.bar = status, _create_bar()
         self.task = self.bar.add_task("", total=None)
-        self.last: tuple[float, TrainingProgress] | None = None  # time, report
-        self.first: tuple[float, int, int] | None = None  # time, step, and number of steps when first drawn
+        self.last_report: tuple[float, TrainingProgress] | None = None  # time, progress
+        self.first_draw: tuple[float, int, int] | None = None  # time, step, and number of steps
 
     def report(self, progress: TrainingProgress) -> None:
-        self.last = time.monotonic(), progress
+        self.last_report = time.monotonic(), progress
         LOG.debug(progress_line(progress))
 
     def __rich__(self) -> Progress:
         now = self.status.now
-        stage, count, done, total = now.stage or "", now.progress, now.step or 0, now.steps
-        if count is None:
+        stage, progress, done, total = now.stage or "", now.progress, now.step or 0, now.steps
+        if progress is None:
             self.bar.update(self.task, total=None, completed=0, description=stage)
-        elif count.unit == "steps" and total:
+        elif progress.unit == "steps" and total:
             self.bar.update(self.task, total=total, completed=done, description=self._training_text(done, total))
         else:
-            text = f"{stage}: {count.done} of {count.total} {count.unit}"
-            self.bar.update(self.task, total=count.total, completed=count.done, description=text)
+            text = f"{stage}: {progress.done} of {progress.total} {progress.unit}"
+            self.bar.update(self.task, total=progress.total, completed=progress.done, description=text)
         return self.bar
 
     def _training_text(self, step: int, steps: int) -> str:
         now = time.monotonic()
-        if self.last and self.last[1].steps == steps:
-            start_time, report = self.last
-            seconds_left = max(0.0, report.seconds_left - (now - start_time))
-            return progress_line(replace(report, step=step, seconds_left=seconds_left))
-        if self.first is None or self.first[2] != steps:
-            self.first = now, step, steps
-        start_time, start_step, _ = self.first
+        if self.last_report and self.last_report[1].steps == steps:
+            start_time, progress = self.last_report
+            seconds_left = max(0.0, progress.seconds_left - (now - start_time))
+            return progress_line(replace(progress, step=step, seconds_left=seconds_left))
+        if self.first_draw is None or self.first_draw[2] != steps:
+            self.first_draw = now, step, steps
+        start_time, start_step, _ = self.first_draw
         seconds = (now - start_time) / (step - start_step) * (steps - step) if step > start_step else None
-        return f"step {step}/{steps}" + ("" if seconds is None else f"  about {clock(seconds)} left")
+        return f"step {step}/{steps}" + ("" if seconds is None else f"  about {clock_text(seconds)} left")
 
 
 def _create_bar() -> Progress:
@@ -230,7 +230,7 @@ def _create_bar() -> Progress:
 @contextmanager
 def _draw(bar: "Progress | _RunBar") -> Iterator[None]:
     """Draw a progress bar several times a second during the block.  Log lines appear above the bar."""
-    with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, counts_as_debug():
+    with Live(bar, console=CONSOLE, refresh_per_second=4, transient=True) as live, logging_counts_as_debug():
         _bars.append(live)
         try:
             yield

@@ -338,7 +338,7 @@ class Model:
         return f"Model({len(self):,} Gaussians{suffix}, SH degree {self.sh_degree})"
 
     def _repr_html_(self) -> str:
-        from clsplat.core.page import summary
+        from clsplat.core.page import render_summary
 
         low, high = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else (np.zeros(3), np.zeros(3))
         rows = {
@@ -350,7 +350,7 @@ class Model:
             **({"origin, world coordinates": position_text(self.origin)} if self.origin.any() else {}),
             "size as PLY": f"{sum(table.nbytes for table in self.tables().values()) / 2**20:,.1f} MiB",
         }
-        return summary(rows)
+        return render_summary(rows)
 
 
 LOG = logging.getLogger("clsplat")

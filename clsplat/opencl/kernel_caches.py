@@ -51,7 +51,7 @@ def require_space() -> None:
 
 def _full_cache_fault() -> str:
     faults = filter(None, map(space_fault, (cache_folder(), *user_cache_folders())))
-    return next((f"{fault}; free some, or set XDG_CACHE_HOME to another folder" for fault in faults), "")
+    return next((f"{fault}; free up space, or set XDG_CACHE_HOME to another folder" for fault in faults), "")
 
 
 @cache

@@ -207,7 +207,7 @@ def _imported_files(module: ModuleType, folder: Path) -> list[Path]:
 def _imports(module: ModuleType) -> list[ModuleType]:
     """Return the modules that the import statements in a module refer to."""
     names: list[str] = []
-    for node in ast.walk(ast.parse(read_file(Path(module.__file__ or ""), kind=ConfigError))):
+    for node in ast.walk(ast.parse(read_file(Path(module.__file__ or ""), error_type=ConfigError))):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):

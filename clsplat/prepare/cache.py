@@ -25,7 +25,7 @@ from clsplat.core.files import (
     write_error,
     write_text,
 )
-from clsplat.core.progress import Count, counts_as_debug
+from clsplat.core.progress import ItemCounter, logging_counts_as_debug
 from clsplat.core.reading import read_json, sha256
 from clsplat.prepare.database import IMAGES, MODEL
 from clsplat.prepare.features import CameraModel
@@ -82,12 +82,12 @@ def prepare(
 
     Raises OutputError when another process is computing one of the results, and the errors of the steps.
     """
-    count = Count("steps of the preparation", len(steps), is_even=False)
+    counter = ItemCounter("steps of the preparation", len(steps), is_uniform=False)
     if reused_names := [planned_step.step.stage for planned_step in steps if not planned_step.reason]:
         LOG.info("reusing the results of %s in %s", ", ".join(reused_names), root)
     for i, planned_step in enumerate(steps):
-        with counts_as_debug():  # each step logs its own progress
-            count.reach(i)
+        with logging_counts_as_debug():  # each step logs its own progress
+            counter.reach(i)
         with _lock_result(planned_step) if planned_step.reason else nullcontext():
             if planned_step.reason and _find_fault(planned_step.folder):  # another process may have made it meanwhile
                 with stage(planned_step.step.stage):
@@ -151,7 +151,7 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
     start = time.perf_counter()
     try:
         if planned_step.step.resumes:
-            remove_partial_files(temporary, border=RECORD)
+            remove_partial_files(temporary, marker=RECORD)
         else:
             shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True, exist_ok=True)

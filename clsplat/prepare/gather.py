@@ -13,7 +13,7 @@ import numpy as np
 
 from clsplat.core.errors import DataError, first_few, pluralize, shell_quote
 from clsplat.core.files import open_atomic
-from clsplat.core.progress import Count
+from clsplat.core.progress import ItemCounter
 from clsplat.core.reading import STARTS, open_regular, read_file
 from clsplat.scene.images import (
     IMAGE_SUFFIXES,
@@ -117,10 +117,10 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     Returns the names of the readable photographs, and a dict from the names of the others to the reasons.  Raises
     DataError when too few can be read, or when all are blank.
     """
-    readable_names, read_errors, count = [], dict[str, str](), Count("photos read", len(names))
+    readable_names, read_errors, counter = [], dict[str, str](), ItemCounter("photos read", len(names))
     blank_count = 0
     for i, name in enumerate(names, 1):
-        count.reach(i)
+        counter.reach(i)
         if _is_gathered(photographs / name, images / name):
             readable_names.append(name)
             continue

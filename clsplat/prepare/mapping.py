@@ -14,7 +14,7 @@ from typing import Any, Literal
 import cv2
 
 from clsplat.core.errors import DataError
-from clsplat.core.progress import Count
+from clsplat.core.progress import ItemCounter
 from clsplat.prepare.database import (
     DATABASE,
     IMAGES,
@@ -162,17 +162,17 @@ def _run_attempt(
     pycolmap.set_random_seed(0)
     with raising_data_error(source / IMAGES, "place the cameras"):
         run_mapper = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
-        count = Count("photos placed", len(image_names(pycolmap, database)))
+        counter = ItemCounter("photos placed", len(image_names(pycolmap, database)))
 
         def on_placed() -> None:
-            count.reach(min(max(2, count.done) + 1, count.total))
+            counter.reach(min(max(2, counter.done) + 1, counter.total))
 
         arguments: dict[str, Any] = {} if is_global else {"next_image_callback": on_placed}
         if attempt.loose and not attempt.dense and previous:
             (out / ".before").mkdir(exist_ok=True)
             previous[0].write(str(out / ".before"))
             arguments["input_path"] = str(out / ".before")
-            count.reach(previous[0].num_reg_images())
+            counter.reach(previous[0].num_reg_images())
         results = run_mapper(str(database), str(out / IMAGES), str(work_folder), options=options, **arguments).values()
     models = [model for model in results if model.num_reg_images() >= MIN_PHOTOGRAPHS and model.num_points3D()]
     return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError, pluralize
 from clsplat.core.files import write_text
-from clsplat.core.progress import Count, polled
+from clsplat.core.progress import ItemCounter, polled
 from clsplat.core.reading import read_json
 from clsplat.prepare.database import (
     DATABASE,
@@ -206,10 +206,10 @@ def _has_space(name: str) -> bool:
 @contextmanager
 def _count_pairs(database: Path, pairs: int) -> Iterator[None]:
     """Report the number of pairs that pycolmap has matched in the block as progress."""
-    count = Count("pairs matched", pairs)
-    with polled(count, lambda: count_matched_pairs(database)):
+    counter = ItemCounter("pairs matched", pairs)
+    with polled(counter, lambda: count_matched_pairs(database)):
         yield
-    count.reach(pairs)
+    counter.reach(pairs)
 
 
 def similar_pairs(descriptors: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:

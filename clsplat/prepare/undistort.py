@@ -9,7 +9,7 @@ import numpy as np
 
 from clsplat.core.errors import DataError
 from clsplat.core.manifest import Manifest, hash_values
-from clsplat.core.progress import Count
+from clsplat.core.progress import ItemCounter
 from clsplat.scene.camera import intern_lens
 from clsplat.scene.colmap_writer import write_colmap
 from clsplat.scene.detect import read_scene
@@ -34,7 +34,7 @@ def undistort_scene(
     names, manifest = _png_names([view.name for view in scene.views]), Manifest(out)
     for name in names:
         manifest.require_listed(out / "images" / name)
-    views, count = [], Count("photos undistorted", len(names))
+    views, counter = [], ItemCounter("photos undistorted", len(names))
     for i, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
         pinhole_view = replace(_downscale(_with_lens(view, undefined_pixels), long_side), alpha="mask")
         image, mask = out / "images" / name, out / "masks" / name
@@ -44,7 +44,7 @@ def undistort_scene(
                 write_image(mask, np.repeat(np.where(is_valid, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
             write_image(image, load_image(pinhole_view))
         views.append(replace(pinhole_view, lens=None))
-        count.reach(i)
+        counter.reach(i)
     write_exposures(out / "images", dict(zip(names, load_exposures(scene.views), strict=True)))
     if times := {name: view.time for view, name in zip(scene.views, names, strict=True) if view.time is not None}:
         write_times(out / "images", times)

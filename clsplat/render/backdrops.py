@@ -68,7 +68,7 @@ class Auto(Backdrop):
     reason: str = ""
     """Written by a run: the reason for the choice."""
 
-    def parts(self) -> dict[str, Any]:
+    def active_values(self) -> dict[str, Any]:
         return {}  # conflicts are not errors, since a run then chooses no sky
 
     @property

@@ -90,7 +90,7 @@ def write_checksums(pipeline: Pipeline, run: Run, previous: Mapping[str, str]) -
     for output in (path for stage in pipeline.stages for path in stage.outputs(run.out)):
         files += sorted(output.rglob("*")) if output.is_dir() else [output]
     new_files = [path for path in dict.fromkeys(files) if path.is_file() and _name(path, run) not in previous]
-    save_checksums(run, {**{_name(path, run): sha256(path, kind=OutputError) for path in new_files}, **previous})
+    save_checksums(run, {**{_name(path, run): sha256(path, error_type=OutputError) for path in new_files}, **previous})
 
 
 def save_checksums(run: Run, sums: Mapping[str, str]) -> None:

@@ -55,7 +55,7 @@ def open_run_folder(state: RunState, start: Start, **values: Any) -> Iterator[St
         with lock.lock_folder(out) as require_lock:
             state = RunState.read(out)  # again: another process may have run there before the lock was taken
             check_run_folder(state, start)
-            remove_partial_files(out, border=PIPELINE)
+            remove_partial_files(out, marker=PIPELINE)
             old_status = read_text(out / STATUS) if state.phase is Phase.DONE else None
             status = StatusFile(out, require_lock, **values)
             status.begin()

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from clsplat.core.errors import DataError, OutputError, first_few, pluralize
 from clsplat.core.machine import cache_folder
-from clsplat.core.progress import Count
+from clsplat.core.progress import ItemCounter
 from clsplat.core.reading import read_file
 from clsplat.scene.images import MAX_BYTES, TAIL_SIZE, decode_image, parse_header
 from clsplat.scene.quality import excludes_all, is_blank
@@ -58,13 +58,13 @@ def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
             if file is not None and file != NO_FILE:
                 views_by_path[file].append(view)
     files = {file: ImageFile() for file in views_by_path}
-    cache, count = DecodedSizes(), Count("photos decoded", len(views_by_path))
+    cache, counter = DecodedSizes(), ItemCounter("photos decoded", len(views_by_path))
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS), "decoding")
     try:
         futures = [pool.submit(_examine, file, views_by_path[file], files[file], cache) for file in views_by_path]
         for number, future in enumerate(as_completed(futures), 1):
             future.result()
-            count.reach(number)
+            counter.reach(number)
     finally:
         pool.shutdown(cancel_futures=True)
         cache.save()

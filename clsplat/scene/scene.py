@@ -205,7 +205,7 @@ class Scene:
         return f"Scene({self.path.name}: {len(self.train)} training and {len(self.test)} test views{fold})"
 
     def _repr_html_(self) -> str:
-        from clsplat.core.page import summary
+        from clsplat.core.page import render_summary
 
         count = len(self.points) if self.points else 0
         rows = {
@@ -215,7 +215,7 @@ class Scene:
             "points": f"{count:,}" if count else "none",
             "extent": f"{self.extent:.3g} scene units",
         }
-        return summary(rows, list(self._thumbnails()))
+        return render_summary(rows, list(self._thumbnails()))
 
     def _thumbnails(self) -> Iterator[tuple[str, NDArray[np.uint8]]]:
         """Yield the names and pixels of a few evenly spaced photographs, except for unreadable ones."""

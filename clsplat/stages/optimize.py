@@ -218,7 +218,7 @@ def report(
         run.records.add(run.step, "distribution", gaussians=count, **distribution(run.model.gaussians))
     run.records.write()
     forecast.add(run.step, psnr, count or 1, fmean(seconds))
-    seconds_left, is_known = forecast.seconds_left, forecast.growth_known
+    seconds_left, is_known = forecast.seconds_left, forecast.is_growth_known
     run.status.note(gaussians=count, seconds_left=round(seconds_left, 1))
     run.on_progress(Progress(run.step, forecast.last_step, loss, forecast.psnr, count, ms, seconds_left, is_known))
 

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from clsplat.core.errors import pluralize, size_text
 from clsplat.core.files import PIPELINE, write_text
-from clsplat.core.page import data_url, duration_text, render, safe_charts
+from clsplat.core.page import data_url, duration_text, mark_charts_safe, render
 from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import QUANTILES, render_view
@@ -31,7 +31,7 @@ from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
 def cameras(run: Run) -> list[Markup]:
     """Draw the cameras of each split and the Gaussians around them, from above and from the side."""
     points = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
-    return safe_charts(camera_plans({split: run.original.split(split) for split in SPLITS}, points))
+    return mark_charts_safe(camera_plans({split: run.original.split(split) for split in SPLITS}, points))
 
 
 # Curves over steps, and of the Gaussians.
@@ -48,7 +48,7 @@ def training_charts(run: Run) -> list[Markup]:
     psnr = list(zip([r["step"] for r in records], moving_average([r["psnr"] for r in records]), strict=True))
     line = {key: [(r["step"], r[key]) for r in records if key in r] for key in ("loss", "gaussians", "ms")}
     running_mean = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], dash)
-    return safe_charts(
+    return mark_charts_safe(
         [
             curve("PSNR, dB", [running_mean, *psnr_lines]),
             *([curve("PSNR before the refit, dB", trial_lines)] if trial_lines else []),
@@ -84,7 +84,7 @@ def gaussians_charts(run: Run) -> list[Markup]:
     def quantiles(name: str) -> list[Line]:
         return [Line([(r["step"], r[name][i]) for r in lines], label) for i, label in enumerate(labels)]
 
-    return safe_charts(
+    return mark_charts_safe(
         [
             curve("size (rms scale, scene units), quantiles", quantiles("size"), logarithmic=True),
             curve("anisotropy (longest / shortest axis), quantiles", quantiles("anisotropy"), logarithmic=True),

@@ -11,7 +11,7 @@ from pathlib import Path
 from clsplat.core import terminal
 from clsplat.core.errors import ClsplatError, ConfigError, DataError, Interrupted
 from clsplat.core.files import PIPELINE, STORE, raising_output_error
-from clsplat.core.progress import Count
+from clsplat.core.progress import ItemCounter
 from clsplat.core.reading import read_json
 from clsplat.core.signals import stop_at_once, stopping_on_signals
 from clsplat.pipeline import matrix
@@ -89,7 +89,7 @@ class Batch:
 
     def __post_init__(self) -> None:
         self._steps = {cell.name: count_steps(cell.pipeline) for cell in self.cells}
-        self._count, self._last_report = Count("steps", sum(self._steps.values())), time.monotonic()
+        self._counter, self._last_report = ItemCounter("steps", sum(self._steps.values())), time.monotonic()
 
     def ready(self) -> None:
         """Prepare for the first cell.  This is called once, before that cell starts."""
@@ -132,8 +132,8 @@ class Batch:
                 completed_steps += step
                 progress.append(f"{name} {step}/{self._steps[name]}")
         names = ", ".join([*progress[:MAX_NAMES], *(["…"] if len(progress) > MAX_NAMES else [])])
-        self._count.label = f"steps ({names})" if progress else "steps"
-        self._count.reach(min(completed_steps, self._count.total))
+        self._counter.label = f"steps ({names})" if progress else "steps"
+        self._counter.reach(min(completed_steps, self._counter.total))
 
     def _is_stopped(self) -> bool:
         """Report progress, since the inline engine calls this regularly; return whether a signal has arrived."""

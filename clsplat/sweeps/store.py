@@ -217,7 +217,7 @@ class CellAttempt:
         """Write and return the manifest, with hashes of all files and of the bits.  Raises OutputError."""
         names = sorted(path.relative_to(self.path).as_posix() for path in self.path.rglob("*") if path.is_file())
         hashed_names = [name for name in names if name not in (LEASE, MANIFEST, ERRORS, LOCK)]
-        files = {name: sha256(self.path / name, kind=OutputError) for name in hashed_names}
+        files = {name: sha256(self.path / name, error_type=OutputError) for name in hashed_names}
         values = {
             "attempt": self.path.name,
             "from": self._values.get("from"),

@@ -220,7 +220,7 @@ class Forecast:
         return moving_average(self._psnrs[-VIEWS:])[-1]
 
     @property
-    def growth_known(self) -> bool:
+    def is_growth_known(self) -> bool:
         """Whether the growth rate is known.  If not, the remaining time is a lower bound."""
         step, count, _ = self._reports[-1]
         return step >= self.growth_end or count > self._reports[0][1]

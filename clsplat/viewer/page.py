@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import OutputError
 from clsplat.core.files import write_text
-from clsplat.core.page import data_url, inline, render, shrink
+from clsplat.core.page import data_url, downscale, inline, render
 from clsplat.core.reading import read_file
 from clsplat.scene.scene import Scene, position_text
 from clsplat.scene.view import View
@@ -189,8 +189,8 @@ def view_entries(
     for view in progress(scene.views):
         pixels, split = read(view), "test" if view.name in test_names else "train"
         is_included = included in ("all", split)
-        photograph = data_url(shrink(pixels, LARGEST)) if is_included else None
-        thumbnail = data_url(shrink(pixels, THUMBNAIL))
+        photograph = data_url(downscale(pixels, LARGEST)) if is_included else None
+        thumbnail = data_url(downscale(pixels, THUMBNAIL))
         views.append(
             {"name": view.name, "split": split, "thumbnail": thumbnail, "photograph": photograph, **camera_data(view)}
         )

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 
 from clsplat.core.errors import ConfigError, quote
 from clsplat.core.files import write_text
-from clsplat.core.page import render, safe_charts
+from clsplat.core.page import mark_charts_safe, render
 from clsplat.core.reading import read_file, sha256
 from clsplat.core.text_table import text_table
 from clsplat.formats.packing import open_hashed
@@ -200,7 +200,7 @@ def page(
         subtitle=f"{model}; PSNR and SSIM of the {split} views, measured on every file after reading it back",
         result=result,
         verdict=_verdict(target, source, chosen),
-        curves=safe_charts([curve("PSNR, dB, over the file's size, MB", _lines(target, source, points))]),
+        curves=mark_charts_safe([curve("PSNR, dB, over the file's size, MB", _lines(target, source, points))]),
         headings=HEADINGS,
         rows=[(point.file, cells(point, source), point == chosen) for point in (source, *points)],
     )

@@ -169,7 +169,7 @@ def claim_folder(out: Path, identity: dict[str, Any], record: str, content: str,
     with lock.lock_folder(out):
         # again, because another process may have started
         _require_same_identity(out, identity, record, content, remedy)
-        remove_partial_files(out, border=PIPELINE)
+        remove_partial_files(out, marker=PIPELINE)
         if not (out / record).exists():
             write_text(out / record, json.dumps(identity, indent=1) + "\n")
         yield

@@ -92,7 +92,7 @@ def test_caches_move_where_built_kernels_do_not_fit(machine, user_folder, monkey
         in caplog.text
     )
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=2**18))
-    with pytest.raises(OutputError, match=r"has only 256 KiB of free space, .* free some, or set XDG_CACHE_HOME"):
+    with pytest.raises(OutputError, match=r"has only 256 KiB of free space, .* free up space, or set XDG_CACHE_HOME"):
         require_space()
 
 
@@ -167,7 +167,7 @@ def test_full_folder_is_not_reported_as_damaged(machine, monkeypatch, free):
     cache_folder()
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free))
     text = kernel_cache_advice()
-    assert ("has only 0 KiB of free space, too little for built kernels; free some" in text) == (not free)
+    assert ("has only 0 KiB of free space, too little for built kernels; free up space" in text) == (not free)
     assert ("is damaged: remove" in text) == bool(free)
 
 

@@ -79,7 +79,7 @@ def test_temporary_files_of_a_killed_write_are_swept_next(tmp_path):
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
     (name,) = [path.name for path in tmp_path.iterdir()]
     assert files.PARTIAL.fullmatch(name)
-    files.remove_partial_files(tmp_path, border="pipeline.yaml")
+    files.remove_partial_files(tmp_path, marker="pipeline.yaml")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from clsplat.core import progress, terminal
-from clsplat.core.progress import Count, Progress, clock, listening, polled
+from clsplat.core.progress import ItemCounter, Progress, clock_text, listening, polled
 from clsplat.prepare.cache import PlannedStep, prepare
 from clsplat.prepare.gather import summarize_placement
 from clsplat.prepare.steps import FindFeatures, MapCameras
@@ -24,18 +24,18 @@ def now(monkeypatch):
 
 
 def test_time_left_follows_from_work_of_this_call(now):
-    count = Count("photographs", 30)
-    assert count.seconds_left is None
+    counter = ItemCounter("photographs", 30)
+    assert counter.seconds_left is None
     now[0] += 10
-    count.reach(5)
-    assert count.seconds_left == 50
+    counter.reach(5)
+    assert counter.seconds_left == 50
     now[0] += 50
-    count.reach(30)
-    assert count.seconds_left == 0
+    counter.reach(30)
+    assert counter.seconds_left == 0
 
 
 def test_work_of_an_earlier_call_takes_no_time(now, monkeypatch):
-    began = Count("photographs", 30)
+    began = ItemCounter("photographs", 30)
     began.reach(20)  # at once: it was there
     now[0] += 5
     began.reach(25)
@@ -43,17 +43,17 @@ def test_work_of_an_earlier_call_takes_no_time(now, monkeypatch):
 
 
 def test_uneven_work_has_no_time_left(now):
-    count = Count("steps of the preparation", 4, is_even=False)
+    counter = ItemCounter("steps of the preparation", 4, is_uniform=False)
     now[0] += 10
-    count.reach(1)
-    assert count.seconds_left is None
+    counter.reach(1)
+    assert counter.seconds_left is None
 
 
 def test_empty_count_is_not_reported(tmp_path):
     heard = []
     with listening(lambda *what, seconds_left: heard.append((*what, seconds_left))):
         prepare([], tmp_path, tmp_path)
-        Count("photographs", 0).reach(0)
+        ItemCounter("photographs", 0).reach(0)
         assert heard == []
         planned = [PlannedStep(MapCameras(), "", "", tmp_path, "")] * 2
         prepare(planned, tmp_path, tmp_path)
@@ -66,10 +66,10 @@ def test_nested_listeners_all_hear(now):
         listening(lambda *what, seconds_left: outer.append((*what, seconds_left))),
         listening(lambda *what, seconds_left: inner.append(what)),
     ):
-        count = Count("pairs", 4)
+        counter = ItemCounter("pairs", 4)
         now[0] += 3
-        count.reach(1)
-    Count("others", 1)
+        counter.reach(1)
+    ItemCounter("others", 1)
     assert inner == [("pairs", 0, 4), ("pairs", 1, 4)]
     assert outer == [("pairs", 0, 4, None), ("pairs", 1, 4, 9)]
 
@@ -83,7 +83,7 @@ def test_uncounted_work_is_polled(monkeypatch):
         if done == 2:
             seen.set()
 
-    with listening(listen), polled(Count("pairs", 9), lambda: 2):
+    with listening(listen), polled(ItemCounter("pairs", 9), lambda: 2):
         assert seen.wait(5)
     assert heard == [0, 2]
     assert not [thread for thread in threading.enumerate() if thread.name == "count"]
@@ -104,12 +104,12 @@ def test_no_time_left_is_shown_while_preparation_steps_remain(tmp_path):
 
 def test_bar_is_shown_on_a_terminal_and_not_in_a_pipe(monkeypatch, capsys):
     with terminal.counts_on_terminal():
-        Count("pairs matched", 4).reach(2)
+        ItemCounter("pairs matched", 4).reach(2)
     assert capsys.readouterr().out == ""
     console = terminal.Console(force_terminal=True, width=100)
     monkeypatch.setattr(terminal, "CONSOLE", console)
     with console.capture() as shown, terminal.counts_on_terminal():
-        Count("pairs matched", 4).reach(2)
+        ItemCounter("pairs matched", 4).reach(2)
     assert "pairs matched: 2 of 4" in shown.get()
 
 
@@ -159,7 +159,7 @@ def test_bar_of_a_run_moves_between_reports(tmp_path, monkeypatch):
 
 def test_warnings_are_printed_above_the_bar(screen, log_shown):
     with terminal.counts_on_terminal():
-        Count("pairs matched", 4)
+        ItemCounter("pairs matched", 4)
         terminal.LOG.warning("cannot be renamed")
         text = screen.getvalue()
     before = text[: text.index("warning: cannot be renamed")]
@@ -168,13 +168,13 @@ def test_warnings_are_printed_above_the_bar(screen, log_shown):
 
 def test_counts_are_not_printed_above_the_bar(now, screen, log_shown):
     with terminal.counts_on_terminal():
-        count = Count("pairs matched", 4)
+        counter = ItemCounter("pairs matched", 4)
         now[0] += 9
-        count.reach(2)
+        counter.reach(2)
     assert "pairs matched: 2 of 4, 0:09 left" not in screen.getvalue()
-    count = Count("pairs matched", 4)
+    counter = ItemCounter("pairs matched", 4)
     now[0] += 9
-    count.reach(2)
+    counter.reach(2)
     assert "pairs matched: 2 of 4, 0:09 left" in screen.getvalue()
 
 
@@ -197,4 +197,4 @@ def test_unreadable_photographs_are_counted():
 
 
 def test_times_are_formatted_like_a_clock():
-    assert [clock(seconds) for seconds in (0, 59.6, 3600, 3725)] == ["0:00", "1:00", "1:00:00", "1:02:05"]
+    assert [clock_text(seconds) for seconds in (0, 59.6, 3600, 3725)] == ["0:00", "1:00", "1:00:00", "1:02:05"]

@@ -92,13 +92,13 @@ def test_impossible_file_name_is_refused(name):
 def test_file_larger_than_expected_is_not_read(tmp_path):
     with (tmp_path / "x").open("wb") as file:
         file.truncate(1 << 40)
-    with pytest.raises(DataError, match="it has 1099511627776 bytes, more than 1000"):
+    with pytest.raises(DataError, match="it has 1099511627776 bytes, more than the limit of 1000"):
         read_file(tmp_path / "x", limit=1000)
-    with pytest.raises(DataError, match="bytes, more than 2147483647"):
+    with pytest.raises(DataError, match="bytes, more than the limit of 2147483647"):
         read_image(tmp_path / "x")
-    with pytest.raises(DataError, match="bytes, more than 134217728"):
+    with pytest.raises(DataError, match="bytes, more than the limit of 134217728"):
         Transforms(tmp_path / "x")
-    with pytest.raises(ConfigError, match="bytes, more than 1048576"):
+    with pytest.raises(ConfigError, match="bytes, more than the limit of 1048576"):
         load(str(tmp_path / "x"))
 
 

@@ -61,7 +61,7 @@ def test_non_plain_data_is_refused_with_its_line(text, tmp_path):
 def test_invalid_utf8_is_refused_with_its_line(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_bytes(b"name: x\nscene: {path: caf\xe9}\n")
-    with pytest.raises(ConfigError, match=r"x.yaml:2: expected UTF-8 text, found the byte 0xe9"):
+    with pytest.raises(ConfigError, match=r"x.yaml:2: expected UTF-8 text, found 0xe9"):
         read_yaml(path)
     path.write_bytes("\ufeffname: x\n".encode())
     assert read_yaml(path).data == {"name": "x"}

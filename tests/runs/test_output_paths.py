@@ -94,7 +94,7 @@ def test_stages_cannot_write_outside_or_over_records(kind):
     ("place", "text"), [("scene.path", "a\\0b"), ("init.file", "\\ud800"), ("evaluate.lpips", "a\\0b")]
 )
 def test_impossible_paths_are_refused_when_read(place, text):
-    with pytest.raises(ConfigError, match="it contains a character that is not allowed in file names"):
+    with pytest.raises(ConfigError, match="a path without NUL characters and with valid Unicode"):
         load("smoke", [f'{place}="{text}"'])
 
 

@@ -133,7 +133,7 @@ def test_unwritable_output_is_one_line(arguments):
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
     assert done.returncode == 7
     assert done.stderr.splitlines() == [
-        "error: stdout: cannot be written (No space left on device); redirect it elsewhere, or free space"
+        "error: stdout: cannot be written (No space left on device); redirect it elsewhere, or free up space"
     ]
 
 

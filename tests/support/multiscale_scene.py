@@ -28,7 +28,7 @@ def write_multiscale(source: Path, out: Path, levels: int = 4) -> int:
     splits = {path.stem.removeprefix("transforms_"): path for path in sorted(source.glob("transforms_*.json"))}
     if "train" not in splits:
         raise DataError(f"{source}: has no transforms_train.json; expected the folder of a Blender dataset")
-    remove_partial_files(out, border=PIPELINE)
+    remove_partial_files(out, marker=PIPELINE)
     metadata = {name: _write_split(Transforms(path), name, out, levels) for name, path in splits.items()}
     write_text(out / "metadata.json", json.dumps(metadata) + "\n")
     points = source / "points3d.ply"

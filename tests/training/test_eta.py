@@ -35,17 +35,17 @@ def test_time_left_includes_future_growth(step, tolerance):
 
 def test_time_left_is_a_lower_bound_before_growth():
     early = forecast_at(200)
-    assert not early.growth_known
+    assert not early.is_growth_known
     assert early.seconds_left == pytest.approx(seconds_at(100) * (LAST - 200))
-    assert forecast_at(400).growth_known
-    progress = Progress(200, LAST, 0.1, 20.0, 8000, 12.0, early.seconds_left, early.growth_known)
+    assert forecast_at(400).is_growth_known
+    progress = Progress(200, LAST, 0.1, 20.0, 8000, 12.0, early.seconds_left, early.is_growth_known)
     assert progress_line(progress).endswith("at least 0:34 left")
 
 
 def test_time_left_without_growth_is_proportional():
     forecast = Forecast.from_rules(0, 100, [])
     forecast.add(50, 20.0, 7, 0.5)
-    assert forecast.growth_known
+    assert forecast.is_growth_known
     assert forecast.seconds_left == 25
 
 

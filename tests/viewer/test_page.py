@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import OutputError
-from clsplat.core.page import inline, shrink
+from clsplat.core.page import downscale, inline
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer import page as module
 from clsplat.viewer.packing import pack
@@ -160,7 +160,7 @@ def test_photographs_of_the_selected_views(tmp_path, which, held):
 
 @pytest.mark.parametrize(("shape", "after"), [((300, 200), (128, 85)), ((100, 128), (100, 128)), ((2, 4000), (1, 128))])
 def test_thumbnails_keep_their_aspect(shape, after):
-    assert shrink(np.zeros((*shape, 3), np.uint8), 128).shape[:2] == after
+    assert downscale(np.zeros((*shape, 3), np.uint8), 128).shape[:2] == after
 
 
 def test_initial_camera_of_a_page(tmp_path):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import pluralize
 from clsplat.core.files import write_text
-from clsplat.core.page import render, safe_charts
+from clsplat.core.page import mark_charts_safe, render
 from clsplat.prepare.inspect.findings import Inspection, summarize
 from clsplat.scene.points import MAX_VALUE
 from clsplat.viewer.charts import camera_plans, histogram
@@ -53,7 +53,7 @@ def _draw_cameras(inspection: Inspection) -> list[Markup]:
     }
     points: NDArray[np.floating] = np.empty((0, 3)) if table is None else table.positions
     finite = points[(np.abs(points) < MAX_VALUE).all(axis=1)]
-    return safe_charts(camera_plans(views, finite))
+    return mark_charts_safe(camera_plans(views, finite))
 
 
 def _draw_points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tuple[str, int]]] | None:
@@ -62,7 +62,7 @@ def _draw_points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tu
     if not counts:
         return None
     lowest = sorted(counts.items(), key=lambda item: item[1])[:MAX_VIEWS]
-    return safe_charts([histogram("views by their number of points", list(counts.values()))]), lowest
+    return mark_charts_safe([histogram("views by their number of points", list(counts.values()))]), lowest
 
 
 def _name_lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:

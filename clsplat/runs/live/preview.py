@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import MemoryLimitError
-from clsplat.core.page import shrink
+from clsplat.core.page import downscale
 from clsplat.core.progress import Progress
 from clsplat.metrics.views import render_view
 from clsplat.render.camera import upload_camera
@@ -249,7 +249,7 @@ class Pictures:
     def _read(self, kind: Kind, index: int) -> bytes:
         start_time = time.thread_time()
         pixels = load_photograph(self.views[index], self._background, self._undistorted)[:, :, :3]
-        data = encode_jpeg(shrink(pixels, JPEG_SIDES[kind]), JPEG_QUALITY)
+        data = encode_jpeg(downscale(pixels, JPEG_SIDES[kind]), JPEG_QUALITY)
         self._budget.spend((time.thread_time() - start_time) / (os.cpu_count() or 1))
         return data
 

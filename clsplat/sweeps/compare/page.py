@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from clsplat.core.errors import ConfigError, DataError, pluralize
 from clsplat.core.files import write_text
-from clsplat.core.page import data_url, duration_text, render, safe_charts
+from clsplat.core.page import data_url, duration_text, mark_charts_safe, render
 from clsplat.pipeline.file import SceneSettings
 from clsplat.runs.results import Points, RunFolder, RunMetrics
 from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing_keys
@@ -250,7 +250,7 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
         curve(f"training PSNR over steps, mean of {VIEWS} views, dB{suffix}", lines(training_points)),
         curve(f"Gaussians over steps{suffix}", lines(lambda run: run.points("train", "gaussians"))),
     ]
-    return safe_charts(charts + _size_charts(rows, "test") + _size_charts(rows, "train"))
+    return mark_charts_safe(charts + _size_charts(rows, "test") + _size_charts(rows, "train"))
 
 
 def _mean(lines: Sequence[Points]) -> Points:

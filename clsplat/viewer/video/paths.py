@@ -241,8 +241,8 @@ def check_fps(fps: float) -> float:
 
 def even_size(camera: Camera) -> Size:
     """Return the size of a camera's image, rounded down to even sides within the bounds of a video."""
-    shrink = min(1.0, SIDES[1] / max(camera.width, camera.height))
-    width, height = (max(SIDES[0], int(side * shrink) // 2 * 2) for side in (camera.width, camera.height))
+    factor = min(1.0, SIDES[1] / max(camera.width, camera.height))
+    width, height = (max(SIDES[0], int(side * factor) // 2 * 2) for side in (camera.width, camera.height))
     return width, height
 
 
