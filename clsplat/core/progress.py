@@ -120,9 +120,6 @@ class ItemCounter:
             LOG.log(_level.get(), "%s: %d of %d%s", self.label, done, self.total, remaining)
 
 
-Count = ItemCounter
-
-
 def counted(items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
     """Yield the items and count them.  An item is done when the next one is requested."""
     counter = ItemCounter(label, total)

@@ -79,10 +79,10 @@ class LearnedField(TrainedField):
         return field
 
     @classmethod
-    def check_tables(cls, shape: Mapping[str, Any], tables: Tables, extra: Tables) -> None:
+    def check_tables(cls, shape: Mapping[str, Any], tables: Tables, extra_tables: Tables) -> None:
         """Raise DataError for tables that do not fit a shape."""
-        if extra:
-            raise DataError(f"it contains {next(iter(extra))} in addition to a field")
+        if extra_tables:
+            raise DataError(f"it contains {next(iter(extra_tables))} in addition to a field")
         if tables.keys() != set(TABLES):
             raise DataError(f"its field does not have the tables {', '.join(TABLES)}")
         parameters = _parse_shape(shape).parameters
@@ -110,7 +110,7 @@ class LearnedField(TrainedField):
         """Copy the tables of the field to the host, each [P, 1]."""
         return {name: array.get()[:, None] for name, array in self._arrays.items()}
 
-    def not_finite(self) -> list[str]:
+    def nonfinite_tables(self) -> list[str]:
         """Return the names of the tables that contain NaN or infinity."""
         device, count = self._gradient.device, self.field.shape.parameters
         counters = {name: device.zeros(1, np.uint32) for name in self._arrays}

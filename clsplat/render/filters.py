@@ -98,7 +98,7 @@ def measure_intervals(
 
 
 class ScreenFilter(Settings):
-    """A blur of splats in the image; a subclass with further keys overrides `numbers`."""
+    """A blur of splats in the image; a subclass with further keys overrides `parameters`."""
 
     pixel_box: ClassVar[bool] = False  # splats are integrated over the pixel's box; the fields below are for viewers
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)]
@@ -110,10 +110,10 @@ class ScreenFilter(Settings):
     def __pydantic_init_subclass__(cls, **values: Any) -> None:
         super().__pydantic_init_subclass__(**values)
         unused = [name for name in cls.model_fields if name not in (*ScreenFilter.model_fields, "type")]
-        if unused and cls.numbers is ScreenFilter.numbers:
-            raise ConfigError(f"{cls.__name__}: its key '{unused[0]}' has no effect; override ScreenFilter.numbers")
+        if unused and cls.parameters is ScreenFilter.parameters:
+            raise ConfigError(f"{cls.__name__}: its key '{unused[0]}' has no effect; override ScreenFilter.parameters")
 
-    def numbers(self) -> tuple[float, float, float]:
+    def parameters(self) -> tuple[float, float, float]:
         """Return `variance`, `compensate`, and 1 to integrate splats over the pixel's box, otherwise 0."""
         return self.variance, float(self.compensate), float(self.pixel_box)
 
@@ -217,4 +217,4 @@ class ModelSettings(Settings):
     def model(self, gaussians: Gaussians, degree: int) -> DeviceModel:
         """Return the Gaussians with the rendering parameters of these settings.  degree: the active SH degree."""
         assert self.near != "auto"  # a run chooses it before its first stage
-        return DeviceModel(gaussians, degree, self.near, *self.screen_filter.numbers())
+        return DeviceModel(gaussians, degree, self.near, *self.screen_filter.parameters())

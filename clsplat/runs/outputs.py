@@ -41,7 +41,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "test": run.metrics.get("test", {}),
         "train": run.metrics.get("train", {}),
         **({"validation": run.metrics["validation"]} if "validation" in run.metrics else {}),
-        **({"kept": run.best.figures()} if run.best else {}),
+        **({"kept": run.best.summary()} if run.best else {}),
         **({"overfit": True} if is_overfit(run) else {}),
         "gaussians": run.gaussians,
         **({"sky_gaussians": sky} if (sky := sky_gaussians(run)) else {}),

@@ -30,7 +30,7 @@ OPEN_SIDE = 120.0  # degrees; a wider gap is a side that was left out on purpose
 UNEVEN = 3.0  # times the median gap
 
 
-def advice(run: Run, is_overfit: bool) -> list[str]:
+def collect_advice(run: Run, is_overfit: bool) -> list[str]:
     """Return at most MAX_LINES sentences of advice, the most important first, each with a command.
 
     Empty if nothing stands out.  Renders at most MAX_MEASURED training views.
@@ -111,7 +111,7 @@ def advise_on_capture(train: Sequence[View], views: Sequence[View], rerun: str) 
     view_count = len({view.name for view in train})
     if view_count < FEW_PHOTOS:
         count = pluralize(view_count, "training photo")
-        yield f"only {count}; show every part in at least five, from several sides, then `{rerun}`"
+        yield f"only {count}; show every part of the scene in at least five, from several sides, then `{rerun}`"
     if gap := find_widest_gap(views):
         degrees, first, second = gap
         yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take some there, then `{rerun}`"

@@ -122,7 +122,7 @@ class Densify(Scheduled):
         return int((~box.contains(edit.gaussians.get("means"))).sum()) if box else 0
 
     def _limits(self, run: Run, edit: Edit) -> Iterator[int]:
-        """Yield the numbers of Gaussians at which the settings stop growth."""
+        """Yield each number of Gaussians at which a setting stops growth."""
         if self._has_growth_ended(run):
             yield 0
         if self.max_gaussians is not None:

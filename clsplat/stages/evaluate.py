@@ -59,7 +59,7 @@ class Evaluate(Scheduled):
     lpips: InputPath | None = None
     """ONNX file of LPIPS, which `clsplat data lpips` writes."""
     lpips_input: InputRange = "-1..1"
-    """Range of the values that LPIPS gets; the tables of 3DGS and Mip-Splatting use 0..1 and the network vgg."""
+    """Range of the input of LPIPS; the tables of 3DGS and Mip-Splatting use 0..1 and the network vgg."""
     file: Annotated[str, AfterValidator(_check_output_path)] | None = None
     """Model file in the run folder to measure; default: the model in training."""
 
@@ -71,9 +71,9 @@ class Evaluate(Scheduled):
         return metrics
 
     def check(self) -> None:
-        self._perceptual()
+        self._open_metrics()
 
-    def _perceptual(self) -> Perceptual:
+    def _open_metrics(self) -> Perceptual:
         return Perceptual.open(self.metrics, self.lpips, self.lpips_input)
 
     def _painter(self, run: Run) -> Painter:
@@ -93,21 +93,21 @@ class Evaluate(Scheduled):
                 key = "holdout" if self.split == "test" else "validation"
                 LOG.warning("no %s views: nothing to evaluate; scene.%s selects them", self.split, key)
             return
-        perceptual, painter = self._perceptual(), self._painter(run)
+        metrics, painter = self._open_metrics(), self._painter(run)
         for downscale in self.downscales or [run.downscale]:
             candidates = learned_scene(run).downscaled(downscale).split(self.split)
             views = sample_views(candidates, self.max_views or len(candidates))
             photographs = run.photographs if downscale in run.scene.downscales else run.photographs.empty_copy()
             progress = run.status.counted(run.until_interrupted(views), "views", len(views))
-            train, colors = run.scene.split("train"), color_model(run)
+            train_views, colors = run.scene.split("train"), color_model(run)
             results = measure(
-                painter, views, photographs, perceptual, colors=colors, progress=progress, train_views=train
+                painter, views, photographs, metrics, colors=colors, progress=progress, train_views=train_views
             )
             if not results:
                 continue
             for result in results:
                 run.records.add(run.model_step, "view", split=self.split, downscale=downscale, **result.line())
-            averages = mean(results, perceptual)
+            averages = mean(results, metrics)
             run.records.add(run.model_step, "evaluate", split=self.split, downscale=downscale, **averages)
             run.metrics.setdefault(self.split, {})[f"{downscale:g}"] = averages
             views_text = f"{f'{self.file}, ' if self.file else ''}{self.split} views at 1/{downscale:g}"

@@ -126,7 +126,7 @@ class Checkpoint(Scheduled):
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})
-    ends: ClassVar[bool] = True
+    runs_at_end: ClassVar[bool] = True
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"keep", "every_seconds"}
 
     keep: Annotated[int, Field(gt=0)] = 2

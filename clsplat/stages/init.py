@@ -44,7 +44,7 @@ def scene_points(scene: Scene) -> PointCloud:
 
 def sweep_photos(run: Run, count: int) -> PointCloud:
     """Return at most `count` points from a plane sweep over the training photos."""
-    views = _views(run)
+    views = _training_views(run)
     return sweep_points(views, scene_center(views), load_image, count, run.seed)
 
 
@@ -53,7 +53,7 @@ def points_with_sweep(run: Run, count: int) -> PointCloud:
 
     Transparent and masked pixels give no points.  Raises DataError if the scene has no points.
     """
-    points, views = scene_points(run.scene), _views(run)
+    points, views = scene_points(run.scene), _training_views(run)
     positions = points.positions.astype(np.float64)
     new_points = sweep_points(views, scene_center(views), load_image, count, run.seed, positions, opaque_pixels)
     if not len(new_points):
@@ -73,7 +73,7 @@ def try_sweep(run: Run, count: int) -> PointCloud | None:
 
 def sample_hull(run: Run, count: int) -> PointCloud | None:
     """Return at most `count` points on the visual hull, or None, with a warning, if there are too few."""
-    points = hull_points(_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
+    points = hull_points(_training_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
     if len(points) < MIN_USABLE:
         remedy = "it needs photos with a transparent background and no mask files; otherwise, use init: {source: sweep}"
         LOG.warning("the visual hull has only %d points; starting from random ones; %s", len(points), remedy)
@@ -81,7 +81,7 @@ def sample_hull(run: Run, count: int) -> PointCloud | None:
     return points
 
 
-def _views(run: Run) -> list[View]:
+def _training_views(run: Run) -> list[View]:
     """Return the training views at the training size."""
     return [view for view in run.scene.split("train") if view.downscale == run.downscale]
 
@@ -134,7 +134,7 @@ class Init(Stage):
         require_times(run.scene, run.model_settings.time)
         source = self._source(run.scene)
         if source == "model":
-            self._read(run.scene)
+            self._read_model(run.scene)
         elif source in ("random", "hull"):
             self._require_memory(run, self.count)
         elif source in ("points", "points+sweep"):
@@ -158,7 +158,7 @@ class Init(Stage):
         """
         source = self._source(scene)
         if source == "model":
-            return len(self._read(scene)["means"])
+            return len(self._read_model(scene)["means"])
         if source in ("points", "points+sweep"):
             return (0 if scene.points is None else len(scene.points)) + self.sweep_points * self._adds_sweep(scene)
         return self.sweep_points if source == "sweep" else self.count
@@ -190,7 +190,7 @@ class Init(Stage):
         """Return the parameters and their source, which is "random" if another source has too few points."""
         source = self._source(run.scene)
         if source == "model":
-            parameters = with_degree(self._read(run.scene), degree)
+            parameters = with_degree(self._read_model(run.scene), degree)
             return with_motion(parameters, run.model_settings.time, str(self.file)), source
         sources: dict[str, Callable[[], PointCloud | None]] = {
             "sweep": lambda: try_sweep(run, self.sweep_points),
@@ -200,7 +200,7 @@ class Init(Stage):
         }
         points = sources[source]() if source in sources else None
         if points is None:
-            points, source = self._random(run), "random"
+            points, source = self._random_points(run), "random"
         if source == "points" and self._adds_sweep(run.scene):
             points, source = points.joined(sweep_photos(run, self.sweep_points)), "points+sweep"
         self._require_memory(run, len(points))
@@ -210,7 +210,7 @@ class Init(Stage):
             parameters, run.model_settings.time, times, (self.duration, self.min_duration), run.seed
         ), source
 
-    def _read(self, scene: Scene) -> Parameters:
+    def _read_model(self, scene: Scene) -> Parameters:
         assert self.file is not None  # as `check` requires
         parameters = load(Path(self.file)).with_origin(scene.origin).tables()
         if not len(parameters["means"]):
@@ -224,7 +224,7 @@ class Init(Stage):
         tables = table_widths(run.model_settings.sh_degree, motion.width if motion else 0)
         run.memory_plan(tables, offload_target(run.harmonics, run.device.info)).check(count, offload_advice(run))
 
-    def _random(self, run: Run) -> PointCloud:
+    def _random_points(self, run: Run) -> PointCloud:
         """Return random points.  Raises MemoryLimitError, before allocating any, if they would not fit."""
         self._require_memory(run, self.count)
         return random_points(run.scene, self.count, run.seed)

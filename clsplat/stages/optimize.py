@@ -23,7 +23,7 @@ from clsplat.training.adam import Adam, Rates, Rows, attach_gradients
 from clsplat.training.best_model import Best, Scores
 from clsplat.training.checkpoint import copy_model, finite_values, restore_best
 from clsplat.training.modules.base import ModuleState, TrainingModule, attach_modules, check_list, implied_modules
-from clsplat.training.records import Forecast, clocks, stage_milliseconds
+from clsplat.training.records import Forecast, read_clocks, stage_milliseconds
 from clsplat.training.run import Run
 from clsplat.training.sh_offload import offload_advice, offload_harmonics
 from clsplat.training.stage import ALL_HARMONICS, Scheduled, Training
@@ -32,7 +32,7 @@ from clsplat.training.trainer import StepTrainer
 LOG = logging.getLogger("clsplat")
 MAX_EVALUATIONS, MIN_INTERVAL = 20, 100  # evaluations of a training run, steps between two of them
 PSNR_AND_SSIM = ("psnr", "ssim")
-ROOMY = 8  # growth rarely reaches a memory limit that is this multiple of the initial number of Gaussians
+MEMORY_MARGIN = 8  # growth rarely reaches a memory limit that is this multiple of the initial number of Gaussians
 MAX_TRAINING_VIEWS = 8  # training views that are measured with the validation views
 
 
@@ -118,16 +118,16 @@ class ValidatedTraining(Training):
         if not any(getattr(stage, "patience", None) for stage in earlier_stages):  # else the first step is unknown
             self.require_measurement(sum(stage.steps for stage in earlier_stages))
 
-    def require_measurement(self, first: int) -> None:
+    def require_measurement(self, start: int) -> None:
         """Raise ConfigError if `keep: best` would not measure any step.
 
-        first: global step before the training.
+        start: global step before the training.
         """
         if self.keep == "last":
             return
-        last = first + self.steps
+        last = start + self.steps
         stages = [stage for stage in self.order_stages(self.during) if _validates(stage)]
-        if not any(stage.is_due(step, step == last) for stage in stages for step in range(first + 1, last + 1)):
+        if not any(stage.is_due(step, step == last) for stage in stages for step in range(start + 1, last + 1)):
             raise ConfigError(
                 "optimize.keep: best needs an evaluation of the validation views before the end; lower the "
                 "`every` of `evaluate` in `during`, or remove that stage to use the default one"
@@ -188,7 +188,7 @@ class ValidatedTraining(Training):
 
 
 def comparable_psnr(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
-    """Return the PSNR of averages in dB, or None.  It is after color fitting if all views of all averages have one."""
+    """Return the PSNR of averages in dB, or None: after color fitting if all views of all averages have this value."""
     has_color = all(
         average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in measured
     )
@@ -244,8 +244,8 @@ class Optimize(ValidatedTraining):
     """Gaussians that a step updates: `all`; `seen`, where culled Gaussians keep their parameters and moments; or
     `deferred`, with the same bits as `all`, where `sh_rest` of culled Gaussians is updated when a view sees them."""
     views_per_update: AtLeastOne = 1
-    """Number of views whose gradients are averaged for an update; by step, where it is a multiple of this number.  It
-    needs `update: all`."""
+    """Number of views whose gradients are averaged for an update, at each step that is a multiple of this number.
+    Needs `update: all`."""
     views: ViewSettings = ViewSettings()
     """View, image size and transforms of each step."""
     losses: list[OneOf[Loss]]
@@ -273,7 +273,7 @@ class Optimize(ValidatedTraining):
         return modules
 
     @model_validator(mode="after")
-    def _with_all_rows(self) -> "Optimize":
+    def _require_all_rows(self) -> "Optimize":
         if self.views_per_update != 1 and self.update != "all":
             raise ValueError("'views_per_update' needs 'update: all'; set one of them to its default")
         return self
@@ -309,22 +309,23 @@ class Optimize(ValidatedTraining):
         self.reset_best(run)
         views = self.views.resolve(run.training_images)
         last_step = run.step - run.stage_step + self.steps
-        trainer, sampler = self._trainer(run, views, last_step), Sampler(run.scene.split("train"), views, run.seed)
+        trainer = self._create_trainer(run, views, last_step)
+        sampler = Sampler(run.scene.split("train"), views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count
         if run.harmonics != "auto" or memory.host == 0:  # else it was checked before the harmonics moved to the host
             memory.check(count, offload_advice(run))
-        is_tight = memory.host or memory.limit < ROOMY * count
+        is_tight = memory.host or memory.limit < MEMORY_MARGIN * count
         LOG.log(logging.INFO if is_tight else logging.DEBUG, memory.text(count))
         forecast = Forecast.from_rules(run.step, last_step, [stage.is_due for stage in self._density])
         seconds: list[float] = []  # of the steps since the last report
         self.act_between(run)
         while not self.has_ended(run):
-            start = clocks()
+            start = read_clocks()
             self._edit(run, views)
-            view = self._step(run, trainer, sampler)
+            gradients = self._step(run, trainer, sampler)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             is_reported = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
-            loss, psnr = finite_values(run, sampler.at(run.step).view.name, view) if is_reported else (0.0, 0.0)
+            loss, psnr = finite_values(run, sampler.at(run.step).view.name, gradients) if is_reported else (0.0, 0.0)
             seconds.append(run.add_training_time(start))
             if is_reported:
                 for module in trainer.modules if run.step == last_step else ():
@@ -332,7 +333,7 @@ class Optimize(ValidatedTraining):
                 report(run, forecast, (loss, psnr), seconds, DISTRIBUTION_INTERVAL * self.log_every)
                 seconds.clear()
             self.end_step(run)
-            yield view
+            yield gradients
         self.finish(run)  # a resumed run may have no steps left
         for module in trainer.modules:
             module.write(run)
@@ -345,14 +346,14 @@ class Optimize(ValidatedTraining):
     @property
     def tables(self) -> set[str]:
         """The tables of the Gaussians that penalties and rules read in addition to the parameters."""
-        parts: list[Penalty | Densify] = [*(loss for loss in self.losses if isinstance(loss, Penalty)), *self._density]
-        return {name for part in parts for name in part.tables}
+        items: list[Penalty | Densify] = [*(loss for loss in self.losses if isinstance(loss, Penalty)), *self._density]
+        return {name for item in items for name in item.tables}
 
     @property
     def _density(self) -> list[Densify]:
         return [stage for stage in self.during if isinstance(stage, Densify)]
 
-    def _trainer(self, run: Run, views: ViewSettings, last_step: int) -> StepTrainer:
+    def _create_trainer(self, run: Run, views: ViewSettings, last_step: int) -> StepTrainer:
         """Add moments, statistics and tables to the run's Gaussians, unless a resumed run has them."""
         gaussians, photographs = run.model.gaussians, run.photographs
         run.stats = SplatStats(gaussians, self.statistics, len(run.scene.split("train")))
@@ -386,17 +387,17 @@ class Optimize(ValidatedTraining):
         run.step += 1
         run.stage_step += 1
         try:
-            view, frozen = self._differentiate(run, trainer, sampler)
+            gradients, frozen = self._differentiate(run, trainer, sampler)
         except BaseException:  # also a second Ctrl-C
             run.step, run.stage_step = run.step - 1, run.stage_step - 1
             run.device.timings.sampling = False
             raise
         with run.editing_tables():
-            trainer.update(view, frozen)
+            trainer.update(gradients, frozen)
             run.during_index, run.edited = 0, False
         run.device.timings.sampling = False
         run.status.note(step=run.step)
-        return view
+        return gradients
 
     def _differentiate(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> tuple[ViewGradients, set[str]]:
         """Return the losses and gradients of a view, and the names of the parameters not to update."""
@@ -407,5 +408,5 @@ class Optimize(ValidatedTraining):
         run.photographs.prefetch(sampler.at(run.step + offset).view for offset in offsets)
         frozen = {name for stage in self.during if stage.is_due(run.step) for name in stage.frozen_parameters(run)}
         trainer.losses = [*self.losses, *run.losses]
-        view = trainer.differentiate(photograph, run.step, sample.transforms)
-        return view, set() if run.stage_step == self.steps else frozen
+        gradients = trainer.differentiate(photograph, run.step, sample.transforms)
+        return gradients, set() if run.stage_step == self.steps else frozen

@@ -30,7 +30,7 @@ LOG = logging.getLogger("clsplat")
 FILE = "clusters.cl"
 TOGETHER = int(constants(FILE)["TOGETHER"])
 BLOCK = 1 << 16  # points on the device at a time, since points have many components
-AT_ONCE = 1024  # vectors per kernel launch, which fit in the cache of a core
+VECTORS_PER_LAUNCH = 1024  # vectors per kernel launch, which fit in the cache of a core
 Floats = NDArray[np.float64]
 Nearest = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]
 UNSEEN = 0.05  # weight of all directions together relative to the observed ones; 0.01 to 0.05 give lego the same errors
@@ -66,7 +66,7 @@ class PaletteSh(Scheduled):
         if not gaussians.sh_degree:
             return
         rest, error = gaussians.get("sh_rest"), visible_error(run)
-        improve = partial(error.palette, rest, nearest=partial(most_alike, run.device))
+        improve = partial(error.improve_palette, rest, nearest=partial(find_most_similar, run.device))
         harmonics = Harmonics.fit(rest, self.quality, error.weights, improve, self.step)
         gaussians.set("sh_rest", harmonics.values)
         gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - harmonics.values))
@@ -98,16 +98,16 @@ class SharePalette(Scheduled):
             average_clusters(run.model.gaussians, "sh_rest")
 
 
-def most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
+def find_most_similar(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return the index of the vector, [E, c], with the largest dot product for each point, [N, c].
 
     The first of equal vectors is chosen.
     """
     blocks = (points[start : start + BLOCK] for start in range(0, len(points), BLOCK))
-    return np.concatenate([_most_alike(device, block, vectors) for block in blocks])
+    return np.concatenate([_find_most_similar(device, block, vectors) for block in blocks])
 
 
-def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
+def _find_most_similar(device: Device, points: NDArray[np.float32], vectors: NDArray[np.float32]) -> NDArray[np.int64]:
     count, components = points.shape
     stride = -(-count // ALIGNMENT) * ALIGNMENT
     planes = np.zeros((components, stride), np.float32)
@@ -118,7 +118,7 @@ def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np
     )  # of equal ones, the first is chosen
     label, largest = device.empty(stride), device.empty(stride)
     device_points, all_vectors = device.upload(planes), device.upload(np.ascontiguousarray(host_vectors, np.float32))
-    for first in range(0, entries, AT_ONCE):
+    for first in range(0, entries, VECTORS_PER_LAUNCH):
         device.program(FILE).most_alike(
             items=-(-count // int(device.tuning["LANES"])),
             points=device_points,
@@ -127,7 +127,7 @@ def _most_alike(device: Device, points: NDArray[np.float32], vectors: NDArray[np
             largest=largest,
             components=components,
             first=first,
-            end=min(first + AT_ONCE, entries),
+            end=min(first + VECTORS_PER_LAUNCH, entries),
             stride=stride,
             count=count,
         )
@@ -186,10 +186,10 @@ class VisibleError:
         channels = error.reshape(len(error), -1, 3)
         return np.asarray((self.mean[:, :, None] * channels).sum(axis=1) / SH_C0)
 
-    def palette(
+    def improve_palette(
         self, rest: NDArray[np.float32], vectors: Floats, *, nearest: Nearest
     ) -> tuple[Floats, NDArray[np.int64]]:
-        """Return vectors, [E, 3 K], with less visible errors than a palette's, and the label of each Gaussian, [N].
+        """Return a palette's vectors, [E, 3 K], improved to less visible errors, and the label of each Gaussian, [N].
 
         This is Lloyd's iteration with the quadratic form of each Gaussian as its distance.  nearest: returns for
         points, [N, c], the index of the vector, [E, c], with the largest dot product.  Unused vectors do not change.

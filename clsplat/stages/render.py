@@ -83,7 +83,7 @@ class Viewer(Stage):
 
     def run(self, run: Run) -> None:
         path, model = run.out / self.file, host_model(run)
-        scene, name = learned_scene(run).downscaled(run.downscale), run.photographs.background_name
+        scene, color = learned_scene(run).downscaled(run.downscale), run.photographs.background_name
 
         def read(view: View) -> NDArray[np.uint8]:
             return run.photographs.get(view).image()
@@ -94,15 +94,15 @@ class Viewer(Stage):
         views = view_entries(scene, read, self.photographs, self.photograph_budget, with_progress)
         viewpoint = Viewpoint.from_points(model.means, scene.views, (scene.split("test") or scene.views)[0])
         packed_model = pack(model, None, sky_center(run))
-        page = Page(f"{run.name} · {run.scene_name}", {run.name: packed_model}, viewpoint, name, views, scene.origin)
-        if page.size > MAX_SIZE and (max_count := page.max_splats):  # without room for any, `write` blames the photos
+        page = Page(f"{run.name} · {run.scene_name}", {run.name: packed_model}, viewpoint, color, views, scene.origin)
+        if page.size > MAX_SIZE and (max_count := page.max_splats):  # 0: `write` reports that the photos are too large
             LOG.warning(
                 "%s: shows only the %s most important splats of %s, so that browsers can open it; "
                 "`clsplat compress` makes smaller models",
                 *(path, f"{max_count:,}", packed_model.count_text),
             )
             page = Page(
-                page.title, {run.name: pack(model, max_count, sky_center(run))}, viewpoint, name, views, scene.origin
+                page.title, {run.name: pack(model, max_count, sky_center(run))}, viewpoint, color, views, scene.origin
             )
         page.write(path)
         LOG.debug("viewer written to %s, %.1f MB", path, path.stat().st_size / 1e6)

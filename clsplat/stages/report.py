@@ -19,16 +19,16 @@ from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import QUANTILES, render_view
 from clsplat.prepare.gather import summarize_placement
 from clsplat.scene.scene import SPLITS, position_text
-from clsplat.stages.advice import advice
+from clsplat.stages.advice import collect_advice
 from clsplat.stages.export import sky_gaussians
 from clsplat.training.best_model import Scores
-from clsplat.training.records import VIEWS, moving_average
+from clsplat.training.records import PSNR_REPORTS, moving_average
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
 from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
 
 
-def cameras(run: Run) -> list[Markup]:
+def draw_cameras(run: Run) -> list[Markup]:
     """Draw the cameras of each split and the Gaussians around them, from above and from the side."""
     points = run.model.gaussians.get("means") if run.gaussians else np.zeros((0, 3), np.float32)
     return mark_charts_safe(camera_plans({split: run.original.split(split) for split in SPLITS}, points))
@@ -46,15 +46,15 @@ def training_charts(run: Run) -> list[Markup]:
     psnr_lines, trial_lines = _psnr_lines(run), _psnr_lines(run, trial=True)
     dash = DOTTED if any(line.name == NAMES["train"] for line in psnr_lines) else 0
     psnr = list(zip([r["step"] for r in records], moving_average([r["psnr"] for r in records]), strict=True))
-    line = {key: [(r["step"], r[key]) for r in records if key in r] for key in ("loss", "gaussians", "ms")}
-    running_mean = Line(psnr, f"training views, mean of the last {VIEWS}", COLORS[0], dash)
+    series = {key: [(r["step"], r[key]) for r in records if key in r] for key in ("loss", "gaussians", "ms")}
+    running_mean = Line(psnr, f"training views, mean of the last {PSNR_REPORTS}", COLORS[0], dash)
     return mark_charts_safe(
         [
             curve("PSNR, dB", [running_mean, *psnr_lines]),
             *([curve("PSNR before the refit, dB", trial_lines)] if trial_lines else []),
-            curve("loss", [Line(line["loss"])], logarithmic=True),
-            curve("Gaussians", [Line(line["gaussians"])]),
-            curve("milliseconds per step", [Line(line["ms"])]),
+            curve("loss", [Line(series["loss"])], logarithmic=True),
+            curve("Gaussians", [Line(series["gaussians"])]),
+            curve("milliseconds per step", [Line(series["ms"])]),
         ]
         if records
         else []
@@ -66,12 +66,12 @@ def _psnr_lines(run: Run, trial: bool = False) -> list[Line]:
 
     trial: whether to return the PSNR of the training before a refit.
     """
-    points: dict[str, dict[int, float]] = {split: {} for split in NAMES}
+    psnr_by_split: dict[str, dict[int, float]] = {split: {} for split in NAMES}
     for line in run.records.read("evaluate", trial):
-        if line["downscale"] == run.downscale and line["split"] in points:
-            points[line["split"]][line["step"]] = line["psnr"]
+        if line["downscale"] == run.downscale and line["split"] in psnr_by_split:
+            psnr_by_split[line["split"]][line["step"]] = line["psnr"]
     colors = dict(zip(NAMES, COLORS, strict=False))
-    return [Line(sorted(psnr.items()), NAMES[split], colors[split]) for split, psnr in points.items() if psnr]
+    return [Line(sorted(psnr.items()), NAMES[split], colors[split]) for split, psnr in psnr_by_split.items() if psnr]
 
 
 def gaussians_charts(run: Run) -> list[Markup]:
@@ -174,7 +174,7 @@ class Times:
     stages: list[StageTime]
 
 
-def times(run: Run) -> Times | None:
+def stage_times(run: Run) -> Times | None:
     """Return the mean time of each stage of a step, or None if no step was sampled."""
     samples = [r["stages"] for r in run.records.read("train") if r.get("stages")]
     totals: dict[str, float] = defaultdict(float)
@@ -200,7 +200,7 @@ class ViewFigure:
     images: dict[str, str]  # label -> data URL
 
 
-def views(run: Run) -> dict[str, list[ViewFigure]]:
+def view_figures(run: Run) -> dict[str, list[ViewFigure]]:
     """Return images of the best and the worst views of the last evaluation, keyed by heading."""
     by_name = {view.name: view for view in run.scene.downscaled(run.downscale).views}
     lines = [r for r in run.records.read("view") if r["downscale"] == run.downscale and r["step"] == run.model_step]
@@ -210,13 +210,13 @@ def views(run: Run) -> dict[str, list[ViewFigure]]:
     best = [r for r in reversed(ranking) if r not in worst][:MAX_VIEWS]
     groups = {"The best views": best, "The worst views": worst}
 
-    def figure(record: dict[str, Any]) -> ViewFigure:
+    def view_figure(record: dict[str, Any]) -> ViewFigure:
         photograph = run.photographs.get(by_name[record["view"]])
         image = render_view(run.painter(), photograph.camera)
         return _figure(record, image, photograph.image())
 
     return {
-        title: [figure(record) for record in run.until_interrupted(records)]
+        title: [view_figure(record) for record in run.until_interrupted(records)]
         for title, records in groups.items()
         if records
     }
@@ -233,8 +233,8 @@ LOG = logging.getLogger("clsplat")
 MORE_METRICS = {  # of clsplat/metrics/views.py: name and unit
     "psnr_color": ("PSNR in the photos' colors", "dB"),
     "psnr_affine": ("PSNR with colors fitted", "dB"),
-    "psnr_held_out_moments": ("PSNR at held-out moments", "dB"),
-    "psnr_other_moments": ("PSNR at other moments", "dB"),
+    "psnr_held_out_moments": ("PSNR at held-out timestamps", "dB"),
+    "psnr_other_moments": ("PSNR at other timestamps", "dB"),
     "psnr_static": ("PSNR of static pixels", "dB"),
     "flicker": ("flicker of static pixels", "levels"),
     "flicker_photographs": ("flicker of the photos there", "levels"),
@@ -252,7 +252,7 @@ class HtmlReport(Stage):
     """Path inside the run folder."""
 
     def run(self, run: Run) -> None:
-        sentences = advice(run, is_overfit(run))
+        sentences = collect_advice(run, is_overfit(run))
         page = render(
             "report.html.j2",
             title=run.scene_name,
@@ -261,15 +261,15 @@ class HtmlReport(Stage):
             overfitting_note=overfitting_note(run),
             advice=sentences,
             photographs=summarize_placement(run.preparation) or f"{pluralize(len(run.original.views), 'photo')}",
-            viewers=_addresses(run, "viewer", run.out / self.file),
-            models=_addresses(run, "export", run.out / self.file),
-            views=views(run),
-            cameras=cameras(run),
-            figures=_figures(run),
+            viewers=_relative_urls(run, "viewer", run.out / self.file),
+            models=_relative_urls(run, "export", run.out / self.file),
+            views=view_figures(run),
+            cameras=draw_cameras(run),
+            figures=_summary_values(run),
             training=training_charts(run),
             gaussians=gaussians_charts(run),
-            times=times(run),
-            settings=_settings(run),
+            times=stage_times(run),
+            settings=_read_pipeline(run),
         )
         write_text(run.out / self.file, page)
         LOG.debug("report written to %s", run.out / self.file)  # the summary of the run names its files
@@ -277,26 +277,26 @@ class HtmlReport(Stage):
             LOG.info("advice: %s", text)
 
 
-def _addresses(run: Run, stage: str, page: Path) -> dict[str, str]:
+def _relative_urls(run: Run, stage: str, page: Path) -> dict[str, str]:
     """Return the relative URLs of the files that stages named `stage` write, by path in the run folder."""
     files = [Path(entry[stage]["file"]) for entry in run.pipeline["stages"] if stage in entry]
     return {file.as_posix(): quote(Path(os.path.relpath(run.out / file, page.parent)).as_posix()) for file in files}
 
 
 def _headline(run: Run) -> str:
-    """Return the most important figures as a line of text."""
+    """Return the most important results as a line of text."""
     test = run.metrics.get("test", {}).get(f"{run.downscale:g}")
     quality = [f"test PSNR {test['psnr']:.2f} dB, SSIM {test['ssim']:.4f}"] if test else []
     quality += [f"the model of step {run.model_step:,}"] if run.model_step != run.step else []
-    facts = _size(run), f"trained for {duration_text(run.train_seconds)}"
+    facts = _model_size(run), f"trained for {duration_text(run.train_seconds)}"
     return " · ".join([*quality, *facts])
 
 
-def _size(run: Run) -> str:
+def _model_size(run: Run) -> str:
     return size_text(run.gaussians, run.learned_field.parameters if run.learned_field else None, sky_gaussians(run))
 
 
-def _figures(run: Run) -> dict[str, str]:
+def _summary_values(run: Run) -> dict[str, str]:
     values = {}
     for split, by_downscale in sorted(run.metrics.items(), key=lambda item: SPLITS.index(item[0])):
         for downscale, averages in by_downscale.items():
@@ -313,7 +313,7 @@ def _figures(run: Run) -> dict[str, str]:
         best_scores = run.best.measured
         values["validation PSNR before the refit"] = f"{best_scores.validation:.2f} dB"
         values["training PSNR before the refit"] = f"{best_scores.train:.2f} dB"
-    text, _, sky = _size(run).partition(" and ")
+    text, _, sky = _model_size(run).partition(" and ")
     number, _, unit = text.partition(" ")
     values[unit] = number + (f" and {sky}" if sky else "")
     values["steps"] = f"{run.step:,}"
@@ -323,6 +323,6 @@ def _figures(run: Run) -> dict[str, str]:
     return values
 
 
-def _settings(run: Run) -> str:
+def _read_pipeline(run: Run) -> str:
     path = run.out / PIPELINE
     return read_text(path) if path.exists() else ""

@@ -96,5 +96,5 @@ class AverageParameters(Scheduled):
             if not any(map(self.is_due, range(run.step - run.stage_step + 1, run.step))):  # no edit after the last step
                 LOG.info("average: training ended before averaging started; the model is that of the last step")
             with run.editing_tables():
-                adam.take_average(run.model.gaussians)
+                adam.apply_average(run.model.gaussians)
                 run.refresh_filter()

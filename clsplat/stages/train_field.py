@@ -17,7 +17,7 @@ from clsplat.nerf.training import AdamStep, LearnedField, RayPhotograph, field_p
 from clsplat.photos.sampling import Order, Uniform, ViewPool
 from clsplat.stages.optimize import report
 from clsplat.training import checkpoint
-from clsplat.training.records import Forecast, clocks
+from clsplat.training.records import Forecast, read_clocks
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage, Training, path_in_run
 
@@ -85,17 +85,17 @@ class TrainField(Training):
 
     def run(self, run: Run) -> None:
         self.check_run(run)
-        field = run.learned_field = self._field(run)
+        field = run.learned_field = self._create_field(run)
         last_step = run.step - run.stage_step + self.steps
         pool, forecast = ViewPool(run.scene.split("train"), run.seed), Forecast.from_rules(run.step, last_step, [])
         seconds: list[float] = []  # of the steps since the last report
         self.act_between(run)
         while not self.has_ended(run):
-            start = clocks()
+            start = read_clocks()
             self._step(run, field, pool)
             run.status.count("steps", run.stage_step, self.steps, step=run.step, steps=last_step)
             is_reported = run.step % self.log_every == 0 or run.stage_step == self.steps or run.interrupted
-            values = self._values(run, field) if is_reported else (0.0, 0.0)
+            values = self._loss_and_psnr(run, field) if is_reported else (0.0, 0.0)
             seconds.append(run.add_training_time(start))
             if is_reported:
                 report(run, forecast, values, seconds)
@@ -107,13 +107,13 @@ class TrainField(Training):
         progress = math.sin(0.5 * math.pi * min(step / self.warm_up, 1.0)) if self.warm_up else 1.0
         return (self.warm_up_from + (1 - self.warm_up_from) * progress) * at_step(self.rate, step)
 
-    def _field(self, run: Run) -> LearnedField:
+    def _create_field(self, run: Run) -> LearnedField:
         """Return the field of a resumed run, or a new one."""
         shape = self.field.with_unit(run.scene).model_copy(update={"unit_auto": None})
         if isinstance(run.learned_field, LearnedField) and run.learned_field.field.shape == shape:
             return run.learned_field
         if run.stage_step:
-            raise DataError("train_field.field: the checkpoint has a field of another shape or unit; train it again")
+            raise DataError("train_field.field: the saved field has another shape or unit; start over with --restart")
         field = LearnedField.initial(shape, run.seed, run.photographs.background)
         LOG.info("training a field with %s parameters", f"{self.field.parameter_count:,}")
         return field
@@ -141,13 +141,13 @@ class TrainField(Training):
             area = view.camera.width * view.camera.height * view.downscale**2  # in original pixels
             yield RayPhotograph(photograph.camera, photograph, self.rays // self.photographs, area)
 
-    def _values(self, run: Run, field: LearnedField) -> tuple[float, float]:
+    def _loss_and_psnr(self, run: Run, field: LearnedField) -> tuple[float, float]:
         """Return the loss of the last step, and the PSNR of its fine level, dB.
 
         Raises NotFiniteError, after saving the state separately, if the loss or the field is not finite.
         """
         loss, error = field.loss(self.coarse_weight)
-        damaged_tables = field.not_finite()
+        damaged_tables = field.nonfinite_tables()
         if damaged_tables or not math.isfinite(loss):
             raise NotFiniteError(f"step {run.step}: the loss is {loss}; {checkpoint.save_failed(run, damaged_tables)}")
         return loss, -10 * math.log10(max(error, 1e-12))

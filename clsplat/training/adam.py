@@ -66,17 +66,17 @@ class Rates(Settings):
     motion: MotionRates = MotionRates()
     """Learning rates of the motion, if Gaussians move."""
 
-    def times(self, factor: float) -> "Rates":
+    def scale(self, factor: float) -> "Rates":
         """Return all rates multiplied by a factor."""
         values = {name: getattr(self, name) for name in PARAMETERS}
         scaled_values = {name: _scale_rate(value, factor) for name, value in values.items()}
-        return self.model_copy(update={**scaled_values, "motion": self.motion.times(factor)})
+        return self.model_copy(update={**scaled_values, "motion": self.motion.scale(factor)})
 
-    def resolve(self, full_size: int) -> "Rates":
-        """Return rates that depend only on the step.  full_size: the first global step with full-size photographs."""
+    def resolve(self, full_size_step: int) -> "Rates":
+        """Return rates that depend only on the step.  full_size_step: the first global step with full-size photos."""
         if not isinstance(self.means, FullSizeDecay):
             return self
-        return self.model_copy(update={"means": self.means.from_step(full_size)})
+        return self.model_copy(update={"means": self.means.from_step(full_size_step)})
 
     def at(self, step: int, extent: float) -> dict[str, float]:
         """Return the rates at a global step, keyed by parameter or motion field.
@@ -134,7 +134,7 @@ class Adam:
         deferred = self._prepare_deferred(rows, model, rates)
         for name in PARAMETERS:
             moment1, moment2 = (gaussians.tables[table].array for table in moment_tables(name))
-            rate, correction2 = self._factors(name, rates)
+            rate, correction2 = self._count_update(name, rates)
             arguments |= {f"{name}_moment1": moment1, f"{name}_moment2": moment2}
             arguments |= {f"{name}_rate": rate, f"{name}_correction2": correction2}
         program = gaussians.device.program("adam.cl", **model.defines)
@@ -158,23 +158,23 @@ class Adam:
         frame: Frame,
         gradients: GaussianGradients,
         rates: dict[str, float],
-        without: Collection[str] = (),
+        frozen: Collection[str] = (),
         rows: Rows = "all",
     ) -> None:
-        """Update all parameters except those in `without` from gradients in memory.
+        """Update all parameters except those in `frozen` from gradients in memory.
 
         Harmonics above the active degree are skipped, because their gradients and moments are zero.
         """
         gaussians, rows = self.gaussians, self._effective_rows(rows)
-        deferred = None if "sh_rest" in without else self._prepare_deferred(rows, model, rates)
+        deferred = None if "sh_rest" in frozen else self._prepare_deferred(rows, model, rates)
         for name in PARAMETERS:
-            if name in without or (name == "sh_rest" and not rates[name]):
+            if name in frozen or (name == "sh_rest" and not rates[name]):
                 continue
             components = gaussians.tables[name].components
             if name == "sh_rest":
                 components = 3 * (sh_coefficients(model.degree) - 1)
             values, moment1, moment2 = (gaussians.tables[table].array for table in (name, *moment_tables(name)))
-            rate, correction2 = self._factors(name, rates)
+            rate, correction2 = self._count_update(name, rates)
             defines = slot_defines(gaussians) if name == "sh_rest" else {}
             gaussians.device.program("adam.cl", **defines).adam_step(
                 items=(-(-gaussians.count // self._lanes), components),
@@ -193,7 +193,7 @@ class Adam:
             )
             if name == "sh_rest":
                 self._record_sh(deferred, frame, rate, correction2)
-        if gaussians.is_moving and MOTION not in without:
+        if gaussians.is_moving and MOTION not in frozen:
             self.updates[MOTION] += 1
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
 
@@ -229,7 +229,7 @@ class Adam:
         if self.gaussians.on_host:
             self.gaussians.on_host.start_download()
 
-    def _factors(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
+    def _count_update(self, name: str, rates: dict[str, float]) -> tuple[float, float]:
         """Count an update of a parameter; return its bias-corrected rate and the correction of its second moment."""
         self.updates[name] += name != "sh_rest" or rates[name] != 0  # see Rates.sh_rest
         updates = max(self.updates[name], 1)
@@ -301,7 +301,7 @@ def _add_to_mean(gaussians: Gaussians, values: Mapping[str, Array], prefix: str,
     program.count_step(items=count, number=gaussians[counts], count=count)
 
 
-def take_average(gaussians: Gaussians) -> None:
+def apply_average(gaussians: Gaussians) -> None:
     """Replace parameters with their averages in all rows that have one, and remove the tables of averages."""
     program = gaussians.device.program("average.cl")
     for name in gaussians.trained:

@@ -1,7 +1,7 @@
-"""Write and read named arrays and notes in an .npz file, with a SHA-256 of each to detect damage.
+"""Write and read named arrays and metadata in an .npz file, with a SHA-256 of each to detect damage.
 
-    NAME.npy          a float32 array; the SHA-256 of all bytes of the member is in the notes
-    meta.npy          the notes: JSON, with the hashes of arrays by name under the key `sha256`
+    NAME.npy          a float32 array; the SHA-256 of all bytes of the member is in the metadata
+    meta.npy          JSON metadata, with the hashes of arrays by name under the key `sha256`
     meta_sha256.npy   the SHA-256 of meta.npy
 
 NumPy can read the arrays.  Any changed byte is detected, except in fields that are not used, such as time stamps.
@@ -24,20 +24,20 @@ from clsplat.core.reading import open_regular
 
 META, META_DIGEST, DIGESTS = "meta", "meta_sha256", "sha256"
 DAMAGE = {None, errno.EINVAL, errno.EISDIR, errno.EIO}  # a seek before the start, a folder, a bad sector
-Notes = dict[str, Any]
+Metadata = dict[str, Any]
 Arrays = dict[str, NDArray[np.float32]]
 
 
-def write(file: BinaryIO, notes: Notes, arrays: Iterable[tuple[str, NDArray[np.float32]]]) -> None:
-    """Write arrays, and notes as JSON.  Only one array is in memory at a time."""
+def write(file: BinaryIO, metadata: Metadata, arrays: Iterable[tuple[str, NDArray[np.float32]]]) -> None:
+    """Write arrays, and metadata as JSON.  Only one array is in memory at a time."""
     with zipfile.ZipFile(file, "w") as archive:
         digests = {name: _add(archive, name, array) for name, array in arrays}
-        digest = _add(archive, META, np.array(json.dumps({**notes, DIGESTS: digests})))
+        digest = _add(archive, META, np.array(json.dumps({**metadata, DIGESTS: digests})))
         _add(archive, META_DIGEST, np.array(digest))
 
 
-def read(path: Path) -> tuple[Notes, Arrays]:
-    """Read notes and arrays.
+def read(path: Path) -> tuple[Metadata, Arrays]:
+    """Read metadata and arrays.
 
     Raises DataError if the file is damaged; its message is only the reason.  Raises OutputError or MemoryError if the
     system cannot read the file, which does not mean that it is damaged.
@@ -45,12 +45,12 @@ def read(path: Path) -> tuple[Notes, Arrays]:
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             _require_sizes(archive, path.stat().st_size)
-            notes = _notes(archive)
-            digests = notes.pop(DIGESTS)
+            metadata = _read_metadata(archive)
+            digests = metadata.pop(DIGESTS)
             expected_names = sorted(f"{name}.npy" for name in (*digests, META, META_DIGEST))
             if sorted(archive.namelist()) != expected_names:
                 raise DataError("its list of contents has changed")
-            return notes, {name: _array(_member(archive, name, digest)) for name, digest in digests.items()}
+            return metadata, {name: _parse_array(_read(archive, name, digest)) for name, digest in digests.items()}
     except MemoryError:
         raise
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes, such as EOFError and TokenError
@@ -94,29 +94,29 @@ def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
         raise DataError(f"it declares more than the file's {size} bytes")
 
 
-def _notes(archive: zipfile.ZipFile) -> Notes:
-    """Read the notes and check them against their SHA-256."""
+def _read_metadata(archive: zipfile.ZipFile) -> Metadata:
+    """Read the metadata and check it against its SHA-256."""
     data = archive.read(f"{META}.npy")
-    if hashlib.sha256(data).hexdigest() != str(_array(archive.read(f"{META_DIGEST}.npy"))):
+    if hashlib.sha256(data).hexdigest() != str(_parse_array(archive.read(f"{META_DIGEST}.npy"))):
         raise DataError("its metadata does not match its checksum")
-    notes = json.loads(str(_array(data)))
-    if not isinstance(notes, dict) or DIGESTS not in notes:
+    metadata = json.loads(str(_parse_array(data)))
+    if not isinstance(metadata, dict) or DIGESTS not in metadata:
         raise DataError("its checksums are missing")
-    return notes
+    return metadata
 
 
-def _member(archive: zipfile.ZipFile, name: str, digest: str) -> bytes:
+def _read(archive: zipfile.ZipFile, name: str, digest: str) -> bytes:
     data = archive.read(f"{name}.npy")
     if hashlib.sha256(data).hexdigest() != digest:
         raise DataError(f"{name} does not match its checksum")
     return data
 
 
-def _array(data: bytes) -> NDArray[Any]:
+def _parse_array(data: bytes) -> NDArray[Any]:
     """Parse a member without a copy, since a damaged header may declare any shape."""
     stream = io.BytesIO(data)
     np.lib.format.read_magic(stream)
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=1000)
-    if fortran or dtype.hasobject:
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=1000)
+    if is_fortran or dtype.hasobject:
         raise DataError("an array does not have the layout of a checkpoint")
     return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)

@@ -77,7 +77,7 @@ class Best(BaseModel):
         first_overfit = self.first_overfit or (last if last.is_overfit else None)
         return self.model_copy(update=changes | {"first_overfit": first_overfit})
 
-    def figures(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """Return the entry of the best model in metrics.json."""
         progress = self.model_dump(include={"evaluations", "last", "first_overfit", "growth_ended", "ended"})
         return {**self.measured.model_dump(), **progress, "refit": self.refit != "none"}
@@ -89,7 +89,7 @@ class Best(BaseModel):
         text = f"By the validation views, the model of step {best.step:,} is the best: {psnrs}{best.overfit_text()}."
         if last.step != best.step:
             overfit = last.overfit_text(self.first_overfit)
-            text += f" At step {last.step:,} it is {last.train:.1f} and {last.validation:.1f} dB{overfit}."
+            text += f" The model of step {last.step:,} has {last.train:.1f} and {last.validation:.1f} dB{overfit}."
         if self.refit != "none":
             return f"{text} Training is then repeated on all training photos for {best.step:,} steps."
         return f"{text} That model is kept." if self.ended is not None else text

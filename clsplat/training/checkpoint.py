@@ -49,11 +49,11 @@ from clsplat.training.run import Run
 from clsplat.training.settings_diff import differences
 from clsplat.training.sh_offload import make_room
 
-# The notes of a checkpoint contain the state of a run without its tables.
+# The metadata of a checkpoint contains the state of a run without its tables.
 
-LARGEST = 10**15  # larger counts and seconds are damage; float64 represents all smaller integers
-Count = Annotated[int, Field(ge=0, le=LARGEST)]
-Seconds = Annotated[float, Field(ge=0, le=LARGEST)]
+MAX_VALUE = 10**15  # larger counts and seconds are damage; float64 represents all smaller integers
+Count = Annotated[int, Field(ge=0, le=MAX_VALUE)]
+Seconds = Annotated[float, Field(ge=0, le=MAX_VALUE)]
 Metrics = dict[str, dict[str, dict[str, Any]]]  # averages by split and downscale factor
 
 
@@ -189,8 +189,8 @@ def check_run_tables(state: State, tables: Arrays) -> None:
     if state.field:
         if state.updates.keys() != {UPDATES}:
             raise DataError("its update counts are not those of a field")
-        kind = field.field_class(state.field)
-        kind.check_tables(state.field["shape"], *split(tables, field.FOLDER))
+        field_type = field.field_class(state.field)
+        field_type.check_tables(state.field["shape"], *split(tables, field.FOLDER))
         return
     best, current = split(tables, best_model.FOLDER)
     best_model.check(state.best, _check_and_remove_modules(state.best.modules if state.best else {}, best))
@@ -209,8 +209,8 @@ def restore_tables(run: Run, state: State, tables: Arrays) -> None:
     """Restore a run's Gaussians, modules, and optimizer, or its field, from the tables of a checkpoint."""
     if state.field:
         tables, _ = split(tables, field.FOLDER)
-        kind = field.field_class(state.field)
-        run.learned_field = kind.from_tables(state.field["shape"], tables, run.photographs.background)
+        field_type = field.field_class(state.field)
+        run.learned_field = field_type.from_tables(state.field["shape"], tables, run.photographs.background)
         run.learned_field.updates = state.updates[UPDATES]
         return
     run.best_tables, tables = split(tables, best_model.FOLDER)
@@ -243,8 +243,8 @@ RATE_FACTOR = 0.1  # multiplies a rate to lower it
 VELOCITY = "motion.velocity"  # its rate is lowered if a motion is not finite
 
 
-def lower_rate(run: Run, broken: Collection[str]) -> str:
-    """Return `key=value` for `--set` that lowers a rate: of the broken parameters, the one furthest above its default.
+def suggest_rate(run: Run, broken: Collection[str]) -> str:
+    """Return `key=value` for `--set`, which lowers the rate of the broken parameter furthest above its default.
 
     The value is a tenth of the current rate, or the default if that is smaller.  A field has only one rate.
     """
@@ -281,7 +281,7 @@ def save(run: Run, keep: int | None = None) -> Path:
     """
     if not run.is_consistent:
         raise ClsplatError(f"{run.out}: step {run.step} is incomplete, so it is not saved; resume the run")
-    if bad_tables := run.not_finite():
+    if bad_tables := run.nonfinite_tables():
         raise NotFiniteError(f"step {run.step}: {save_failed(run, bad_tables)}")
     path = _write(run, "refit" if run.is_refit else "step")
     run.status.saved_at = time.monotonic()
@@ -304,7 +304,7 @@ def save_failed(run: Run, broken: list[str]) -> str:
     checkpoints = list_files(run.out)
     return (
         f"parameters not finite: {', '.join(broken) or 'none'}; {state}; "
-        f"`clsplat resume {shell_quote(run.out)} --set {lower_rate(run, broken)}` lowers a rate and "
+        f"`clsplat resume {shell_quote(run.out)} --set {suggest_rate(run, broken)}` lowers a rate and "
         f"{f'resumes from {checkpoints[-1].name}' if checkpoints else 'starts over'}"
     )
 
@@ -320,15 +320,15 @@ def list_files(out: Path) -> list[Path]:
 
 
 def load(path: Path) -> tuple[State, Arrays]:
-    """Read a checkpoint.  Raises DataError (only the reason) if it is damaged, and ConfigError for another format."""
-    notes, tables = archive.read(path)
-    if type(notes.get("format")) is int and notes["format"] != FORMAT:
+    """Read a checkpoint.  Raises DataError, with only the reason, if it is damaged; ConfigError for another format."""
+    metadata, tables = archive.read(path)
+    if type(metadata.get("format")) is int and metadata["format"] != FORMAT:
         raise ConfigError(
-            f"{path}: has format {notes['format']}, expected {FORMAT}; resume it with the version that wrote it, "
+            f"{path}: has format {metadata['format']}, expected {FORMAT}; resume it with the version that wrote it, "
             "or use another --out"
         )
     try:
-        state = State.model_validate(notes)
+        state = State.model_validate(metadata)
     except ValidationError as error:
         first = error.errors()[0]
         raise DataError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
@@ -359,7 +359,7 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
     change on resume, or for another format; OutputError if all checkpoints are damaged or missing.
     """
     paths = list_files(run.out)
-    restart = f"`clsplat run {shell_quote(run.out / PIPELINE)} --out {shell_quote(run.out)} --restart` starts over"
+    restart = f"start over with `clsplat run {shell_quote(run.out / PIPELINE)} --out {shell_quote(run.out)} --restart`"
     for path in reversed(paths):
         try:
             state, tables = load(path)
@@ -405,7 +405,7 @@ def _warn_once(text: str) -> None:
     LOG.warning("%s", text)
 
 
-def _write(run: Run, kind: str) -> Path:
+def _write(run: Run, prefix: str) -> Path:
     run.status.require_lock()
     run.records.write()  # the state counts them
     state = State(
@@ -426,7 +426,7 @@ def _write(run: Run, kind: str) -> Path:
         train_seconds=run.train_seconds,
         cpu_seconds=run.cpu_seconds,
         metrics=run.metrics,
-        records=run.records.lines if run.stage_step else run.records.lines_at_stage,
+        records=run.records.line_count if run.stage_step else run.records.line_count_at_stage,
         model_hashes=run.model_hashes,
         changes=run.changes,
         device=run.device.text,
@@ -434,7 +434,7 @@ def _write(run: Run, kind: str) -> Path:
         file_hashes=run.file_hashes,
         pipeline=run.pipeline,
     )
-    path = run.out / CHECKPOINTS / f"{kind}_{run.step:06d}.npz"
+    path = run.out / CHECKPOINTS / f"{prefix}_{run.step:06d}.npz"
     with open_atomic(path) as file:
         archive.write(file, state.model_dump(), run_tables(run))
     return path
@@ -447,7 +447,7 @@ def _field_entry(run: Run) -> dict[str, Any] | None:
 
 def _record_changes(run: Run, path: Path, state: State) -> list[str]:
     """Record and return the changed settings.  Raises ConfigError for one that cannot change on resume."""
-    changes, remedy = [], "restore it, or start over with `clsplat run --restart` or another --out"
+    changes, remedy = [], "restore the setting, or start over with `clsplat run --restart` or another --out"
     previous = state.pipeline
     if run.inputs and state.inputs == run.inputs:  # the same scene, possibly moved
         previous = {**previous, "scene": {**previous["scene"], "path": run.pipeline["scene"]["path"]}}
@@ -459,7 +459,7 @@ def _record_changes(run: Run, path: Path, state: State) -> list[str]:
         if difference.kind is None:
             raise ConfigError(f"{path} was saved with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.stage_index:
-            raise ConfigError(f"{path} was saved after that stage, at step {state.step}: {difference}; {remedy}")
+            raise ConfigError(f"{path} was saved at step {state.step}, after that stage: {difference}; {remedy}")
         if state.best and state.best.refit == "begun" and difference.key_path.endswith((".steps", ".patience")):
             raise ConfigError(f"{path} is from a refit, whose steps were chosen by validation: {difference}; {remedy}")
         is_end = difference.key_path.endswith(".steps")  # an earlier end of the training
@@ -479,7 +479,7 @@ def _restore(run: Run, state: State, tables: Arrays) -> None:
         run.use_split(run.original.merge_validation())
     restore_tables(run, state, tables)
     run.train_seconds, run.cpu_seconds, run.metrics = state.train_seconds, state.cpu_seconds, state.metrics
-    run.records.lines, run.resumed_inputs, run.model_hashes = state.records, state.inputs, state.model_hashes
+    run.records.line_count, run.resumed_inputs, run.model_hashes = state.records, state.inputs, state.model_hashes
 
 
 # Save the state of a run that fails.
@@ -493,7 +493,7 @@ def save_on_failure(run: Run) -> Iterator[None]:
     except (Interrupted, NotFiniteError):  # already saved
         raise
     except (Exception, SystemExit, GeneratorExit):  # plug-ins may raise any; a second Ctrl-C stops at once
-        if run.step > 0 and not run.status.lost:
+        if run.step > 0 and not run.status.lock_error:
             LOG.warning(_save_if_consistent(run))
         raise
 
@@ -503,7 +503,7 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 
     Raises NotFiniteError, after saving the state as failed_N.npz, if the loss or the model is not finite.
     """
-    bad_tables, loss = run.not_finite(), losses.loss
+    bad_tables, loss = run.nonfinite_tables(), losses.loss
     if bad_tables or not math.isfinite(loss):
         raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {save_failed(run, bad_tables)}")
     return loss, psnr(losses.comparison)
@@ -512,7 +512,7 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 def _save_if_consistent(run: Run) -> str:
     """Save the state if it is consistent and finite; return a clause that reports the result."""
     try:
-        if run.is_consistent and not run.not_finite() and run.gaussians != 0:
+        if run.is_consistent and not run.nonfinite_tables() and run.gaussians != 0:
             return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` continues from it"
         reason = "the failed step was incomplete" if not run.is_consistent else "the model is not finite"
     except Exception as error:  # must not hide the original failure

@@ -45,13 +45,13 @@ class TrainedField(ABC):
         """Copy the tables to the host, keyed by name."""
 
     @abstractmethod
-    def not_finite(self) -> list[str]:
+    def nonfinite_tables(self) -> list[str]:
         """Return the names of the tables that contain NaN or infinity."""
 
     @classmethod
     @abstractmethod
-    def check_tables(cls, shape: Mapping[str, Any], tables: Tables, others: Tables) -> None:
-        """Raise DataError if tables do not fit a field of this shape, or if there are `others`, which no field has."""
+    def check_tables(cls, shape: Mapping[str, Any], tables: Tables, extra_tables: Tables) -> None:
+        """Raise DataError if tables do not fit a field of this shape, or if there are tables that no field has."""
 
     @classmethod
     @abstractmethod
@@ -63,7 +63,7 @@ class TrainedField(ABC):
 
 def field_class(entry: Mapping[str, Any]) -> type[TrainedField]:
     """Return the class of a field in a checkpoint.  Raises DataError for an unknown kind."""
-    kind = TrainedField.kinds.get(str(entry.get("kind")))
-    if kind is None or not isinstance(entry.get("shape"), dict):
+    field_type = TrainedField.kinds.get(str(entry.get("kind")))
+    if field_type is None or not isinstance(entry.get("shape"), dict):
         raise DataError(f"it contains a field of an unknown kind; expected {', '.join(TrainedField.kinds)}")
-    return kind
+    return field_type

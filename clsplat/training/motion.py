@@ -42,7 +42,7 @@ class MotionRates(Settings):
     min_duration: Annotated[float, Field(ge=0, lt=1)] = 0.02
     """Lower bound of durations; a Gaussian that is much shorter than a frame is invisible between two frames."""
 
-    def times(self, factor: float) -> "MotionRates":
+    def scale(self, factor: float) -> "MotionRates":
         """Return the rates, each multiplied by a factor."""
         return self.model_copy(update={name: divide(getattr(self, name), 1 / factor) for name in self._rates})
 

@@ -21,7 +21,7 @@ from clsplat.opencl.device import Timings
 
 LOG = logging.getLogger("clsplat")
 _METRIC_FIELDS: dict[str, type | tuple[type, ...]] = {"split": str, "downscale": (int, float), "psnr": (int, float)}
-FIELDS: dict[str, dict[str, type | tuple[type, ...]]] = {  # what pages and `clsplat status` read, by kind
+FIELDS: dict[str, dict[str, type | tuple[type, ...]]] = {  # fields that pages and `clsplat status` read, by kind
     "train": {"loss": (int, float), "psnr": (int, float)},
     "evaluate": _METRIC_FIELDS,
     "view": {"view": str, **_METRIC_FIELDS},
@@ -42,8 +42,8 @@ class Records:
         self.out = out
         self._require_lock = require_lock
         self.path, self.trial = out / RECORDS, out / TRIAL
-        self.lines = 0  # number of lines in the state of the run, including buffered ones
-        self.lines_at_stage = 0  # number of lines at the start of the stage, which a resumed run repeats
+        self.line_count = 0  # number of lines in the state of the run, including buffered ones
+        self.line_count_at_stage = 0  # number of lines at the start of the stage, which a resumed run repeats
         self._pending: list[str] = []
 
     def move_to_trial(self) -> None:
@@ -52,7 +52,7 @@ class Records:
         self._require_lock()
         with raising_output_error(self.trial):
             self.path.replace(self.trial)
-        self.lines = 0
+        self.line_count = 0
 
     def start(self, is_refit: bool = False) -> None:
         """Drop the lines that were written after the restored state; the resumed run writes them again.
@@ -66,19 +66,19 @@ class Records:
         lines: list[dict[str, Any]] = []
         fault = "the file is too short"
         try:
-            for line in islice(self._parse(self.path), self.lines):
+            for line in islice(self._parse(self.path), self.line_count):
                 lines.append(line)
         except DataError as error:
             fault = str(error)
-        if len(lines) < self.lines:
-            LOG.warning("%s: only %d of %d lines can be read (%s)", self.path, len(lines), self.lines, fault)
-        self.lines = self.lines_at_stage = len(lines)
+        if len(lines) < self.line_count:
+            LOG.warning("%s: only %d of %d lines can be read (%s)", self.path, len(lines), self.line_count, fault)
+        self.line_count = self.line_count_at_stage = len(lines)
         write_text(self.path, "".join(json.dumps(line) + "\n" for line in lines))
 
     def add(self, step: int, kind: str, **values: Any) -> None:
         """Add a line; `write` or the end of the stage appends it to the file."""
         self._pending.append(json.dumps({"step": step, "kind": kind, **values}) + "\n")
-        self.lines += 1
+        self.line_count += 1
 
     def write(self) -> None:
         """Append the buffered lines, and sync the file, because a checkpoint contains their number.
@@ -94,13 +94,13 @@ class Records:
     @contextmanager
     def stage(self) -> Iterator[None]:
         """Write the lines that the block adds when it ends; drop them if it fails."""
-        lines, pending = self.lines, len(self._pending)
+        lines, pending = self.line_count, len(self._pending)
         try:
             yield
             self.write()
         except BaseException:
             del self._pending[pending:]
-            self.lines = lines
+            self.line_count = lines
             raise
 
     def read(self, kind: str | None = None, trial: bool = False) -> list[dict[str, Any]]:
@@ -175,24 +175,24 @@ def stage_milliseconds(timings: Timings, steps: int = 1) -> dict[str, float]:
     return {name: totals[name] for name in (*KERNELS, "other") if name in totals}
 
 
-def clocks() -> tuple[float, float]:
+def read_clocks() -> tuple[float, float]:
     """Return the wall-clock time and the CPU time of all threads, s."""
     return time.perf_counter(), time.process_time()
 
 
 # The progress of training: PSNR averaged over reports, and the remaining time.
 
-VIEWS = 5  # reports over which PSNR is averaged
-LATEST = 3  # reports over which step time is averaged
-TREND = 4  # reports from which growth is extrapolated
+PSNR_REPORTS = 5  # reports over which PSNR is averaged
+TIME_REPORTS = 3  # reports over which step time is averaged
+GROWTH_REPORTS = 4  # reports from which growth is extrapolated
 MIN_RATIO = 2.0  # between Gaussian counts, so that the cost of one can be fitted
 DEFAULT_COST = 0.6  # time of an additional Gaussian, relative to the mean, if it cannot be fitted
 MIN_COST = 0.4  # likewise; fits are unreliable on a busy machine
 
 
 def moving_average(psnrs: Sequence[float]) -> list[float]:
-    """Return the moving average of PSNR over VIEWS reports.  Each report covers one view, and views differ a lot."""
-    return [fmean(psnrs[max(0, end - VIEWS) : end]) for end in range(1, len(psnrs) + 1)]
+    """Return the moving average of PSNR over PSNR_REPORTS reports, each of one view, because views differ a lot."""
+    return [fmean(psnrs[max(0, end - PSNR_REPORTS) : end]) for end in range(1, len(psnrs) + 1)]
 
 
 class Forecast:
@@ -217,7 +217,7 @@ class Forecast:
     @property
     def psnr(self) -> float:
         """The mean PSNR of the last reports, dB."""
-        return moving_average(self._psnrs[-VIEWS:])[-1]
+        return moving_average(self._psnrs[-PSNR_REPORTS:])[-1]
 
     @property
     def is_growth_known(self) -> bool:
@@ -234,18 +234,18 @@ class Forecast:
         """
         steps, counts, seconds = (np.array(column, np.float64) for column in zip(*self._reports, strict=True))
         cost, steps_left = self._cost(counts, seconds), self.last_step - steps[-1]
-        current_seconds = float(seconds[-LATEST:].mean() + cost * (counts[-1] - counts[-LATEST:].mean()))
+        current_seconds = float(seconds[-TIME_REPORTS:].mean() + cost * (counts[-1] - counts[-TIME_REPORTS:].mean()))
         growth_steps = min(max(0.0, self.growth_end - steps[-1]), steps_left)
         if growth_steps == 0 or len(steps) < 2:
             return current_seconds * float(steps_left)
-        growth = (counts[-1] - counts[-TREND:][0]) / (steps[-1] - steps[-TREND:][0])
+        growth = (counts[-1] - counts[-GROWTH_REPORTS:][0]) / (steps[-1] - steps[-GROWTH_REPORTS:][0])
         final_seconds = current_seconds + max(0.0, cost * growth * growth_steps)
         return float(growth_steps * (current_seconds + final_seconds) / 2 + (steps_left - growth_steps) * final_seconds)
 
     @staticmethod
     def _cost(counts: NDArray[np.float64], seconds: NDArray[np.float64]) -> float:
         """Return the time that one more Gaussian adds to a step, s."""
-        mean_time = float(seconds[-LATEST:].mean() / max(1.0, counts[-LATEST:].mean()))
+        mean_time = float(seconds[-TIME_REPORTS:].mean() / max(1.0, counts[-TIME_REPORTS:].mean()))
         if counts.max() < MIN_RATIO * counts.min():
             return DEFAULT_COST * mean_time
         deviation = counts - counts.mean()

@@ -29,7 +29,7 @@ from clsplat.training.adam import Adam
 from clsplat.training.best_model import Best, Tables
 from clsplat.training.field import TrainedField
 from clsplat.training.memory import VISIBLE_FRACTION, Harmonics, Location, MemoryPlan, max_pixels, module_bytes, plan
-from clsplat.training.records import Records, clocks
+from clsplat.training.records import Records, read_clocks
 from clsplat.training.status import StatusFile
 
 Item = TypeVar("Item")
@@ -64,7 +64,7 @@ class Run:
     step: int = 0  # global step that is done or in progress
     stage_index: int = 0  # current stage
     stage_step: int = 0  # steps done in that stage
-    during_index: int = 0  # stages of its `during` done after that step
+    during_index: int = 0  # number of stages in `during` done after that step
     edited: bool = False  # whether the edits due at that step are done
     is_consistent: bool = True  # False after a failure in the middle of an edit of the tables
     changes: list[str] = field(default_factory=list)  # of settings, on resume
@@ -113,14 +113,14 @@ class Run:
         """The number of Gaussians; None if a field is trained."""
         return None if self.learned_field else self.model.gaussians.count
 
-    def not_finite(self) -> list[str]:
+    def nonfinite_tables(self) -> list[str]:
         """Return the names of the trained tables that contain NaN or infinity."""
-        return self.learned_field.not_finite() if self.learned_field else self.model.gaussians.not_finite()
+        return self.learned_field.nonfinite_tables() if self.learned_field else self.model.gaussians.nonfinite_tables()
 
     def next_stage(self, index: int) -> None:
         """Move to the start of a stage."""
         self.stage_index, self.stage_step, self.during_index, self.edited = index, 0, 0, False
-        self.records.lines_at_stage = self.records.lines
+        self.records.line_count_at_stage = self.records.line_count
         self.modules = {name: state for name, state in self.modules.items() if state.after_training != "dropped"}
         if self._model is not None:
             self.model.gaussians.tables.pop(HIDDEN, None)  # valid only within one training
@@ -165,8 +165,8 @@ class Run:
         self.is_consistent = was_consistent
 
     def add_training_time(self, start: tuple[float, float]) -> float:
-        """Add the time since `start`, a result of `clocks`, to the training time.  Return the wall-clock seconds."""
-        seconds, cpu = (end - begin for end, begin in zip(clocks(), start, strict=True))
+        """Add the time since `start`, from `read_clocks`, to the training time.  Return the wall-clock seconds."""
+        seconds, cpu = (end - begin for end, begin in zip(read_clocks(), start, strict=True))
         self.train_seconds += seconds
         self.cpu_seconds += cpu
         return seconds
@@ -263,7 +263,7 @@ def host_model(run: Run) -> Model:
 
 
 def sky_center(run: Run) -> NDArray[np.float64]:
-    """Return the median camera position, [3]; seen from there, Gaussians of the sky agree with its map."""
+    """Return the median camera position, [3]; seen from there, Gaussians of the sky agree with the sky's map."""
     return np.median([view.position for view in run.scene.views], axis=0)
 
 

@@ -42,26 +42,26 @@ def differences(
     """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
-            inner, inner_kind = _child(settings, key)
+            child, child_kind = _child(settings, key)
             path = f"{key_path}.{key}" if key_path else str(key)
-            yield from differences(old.get(key), new.get(key), inner, path, kind or inner_kind)
-    elif isinstance(old, list) and isinstance(new, list) and (kinds := _kinds([*old, *new])):
+            yield from differences(old.get(key), new.get(key), child, path, kind or child_kind)
+    elif isinstance(old, list) and isinstance(new, list) and (classes := _item_classes([*old, *new])):
         before, after = ({item["type"]: item for item in entries} for entries in (old, new))
         items = {item.type: item for item in settings or ()}
         for name in dict.fromkeys([*before, *after]):
             item_kind = kind or (
-                "training" if kinds[name].optional_on_resume and not {name} <= before.keys() & after.keys() else None
+                "training" if classes[name].optional_on_resume and not {name} <= before.keys() & after.keys() else None
             )
             yield from differences(before.get(name), after.get(name), items.get(name), f"{key_path}.{name}", item_kind)
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for i, (before, after) in enumerate(zip(old, new, strict=True)):
-            inner = settings[i] if isinstance(settings, list) else None
-            yield from differences(before, after, inner, f"{key_path}[{i}]", kind)
+            child = settings[i] if isinstance(settings, list) else None
+            yield from differences(before, after, child, f"{key_path}[{i}]", kind)
     elif old != new:
         yield Difference(key_path, old, new, kind)
 
 
-def _kinds(items: list[Any]) -> dict[str, Any]:
+def _item_classes(items: list[Any]) -> dict[str, Any]:
     """Return the settings classes of a list's items, keyed by type; empty unless all items are addressed by type."""
     classes = {tag[1]: kind for kind in Settings.subclasses if kind.keyed_by_type and (tag := variant_tag(kind))}
     types = [str(item.get("type")) if isinstance(item, dict) else "" for item in items]

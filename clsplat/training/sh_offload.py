@@ -41,15 +41,15 @@ def make_room(run: Run, count: int) -> None:
     )
 
 
-def device_capacity(run: Run, needed: float = math.inf) -> int:
+def device_capacity(run: Run, required: float = math.inf) -> int:
     """Return the number of Gaussians that fit on the device, with offloaded harmonics if the settings allow it.
 
-    With `auto`, the result does not depend on where the harmonics are now.  needed: number of Gaussians that must fit;
-    if they fit without offloading, the fraction of visible Gaussians is not measured.
+    With `auto`, the result does not depend on where the harmonics are now.  required: number of Gaussians that must
+    fit; if they fit without offloading, the fraction of visible Gaussians is not measured.
     """
     location = offload_target(run.harmonics, run.device.info)
     capacity = _plan(run, location if run.harmonics == "host" else "device").limit
-    if run.harmonics != "auto" or location == "device" or min(needed, FACTOR * run.model.gaussians.count) <= capacity:
+    if run.harmonics != "auto" or location == "device" or min(required, FACTOR * run.model.gaussians.count) <= capacity:
         return capacity
     current = run.model.gaussians.count if run.stage_step else 0
     return max(capacity, current, _plan(run, "host", _visible_fraction(run)).limit)

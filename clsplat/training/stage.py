@@ -41,11 +41,11 @@ def path_in_run(*suffixes: str) -> PathInRun:
     return PathInRun(check, suffixes)
 
 
-def _marks(kind: Any, metadata: Iterable[Any]) -> list[PathInRun]:
+def _marks(annotation: Any, metadata: Iterable[Any]) -> list[PathInRun]:
     """Return the markers in metadata and in the metadata of a type's arguments."""
     marks = [mark for mark in metadata if isinstance(mark, PathInRun)]
     return marks + [
-        mark for argument in get_args(kind) for mark in _marks(argument, getattr(argument, "__metadata__", ()))
+        mark for argument in get_args(annotation) for mark in _marks(argument, getattr(argument, "__metadata__", ()))
     ]
 
 
@@ -105,10 +105,10 @@ class Scheduled(Stage):
 
     training_keys: ClassVar[frozenset[str]] = CADENCE
     step_keys: ClassVar[frozenset[str]] = CADENCE
-    ends: ClassVar[bool] = False  # whether it also runs after the last step of training
+    runs_at_end: ClassVar[bool] = False  # whether it also runs after the last step of training
 
     every: EverySteps | None = None
-    """Steps from one run of the stage to the next, may be fractional; only in `during`."""
+    """Number of steps from one run of the stage to the next, may be fractional; only in `during`."""
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the stage runs."""
     stop: Annotated[int, Field(gt=0)] | None = None
@@ -122,7 +122,7 @@ class Scheduled(Stage):
 
     def is_due(self, step: int, is_last: bool = False) -> bool:
         """Return whether the stage runs at a global step.  is_last: whether it is the last step of training."""
-        if self.every is None or not (fires_at(self.every, step) or (is_last and self.ends)):
+        if self.every is None or not (fires_at(self.every, step) or (is_last and self.runs_at_end)):
             return False
         return step > self.start and (self.stop is None or step < self.stop)
 

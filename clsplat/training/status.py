@@ -27,7 +27,7 @@ Count = Annotated[int, Field(ge=0, lt=1 << 63)]
 Seconds = Annotated[float, Field(gt=-1e15, lt=1e15)]
 
 
-class Amount(BaseModel):
+class StageProgress(BaseModel):
     """The progress of a stage."""
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
@@ -53,10 +53,10 @@ class Status(BaseModel):
     """starting: opens the device; preparing: prepares and reads the scene; running: runs stages; others are final."""
     stage: str | None = None
     """Current or last stage, or step of `prepare`; of a matrix, the cell."""
-    progress: Amount | None = None
+    progress: StageProgress | None = None
     """Progress of that stage, if it can be counted."""
     step: Count | None = None
-    """Training steps done, of all stages; not of a matrix."""
+    """Training steps done in all stages; missing for a matrix."""
     steps: Count | None = None
     """Step at which the current training ends."""
     gaussians: Count | None = None
@@ -132,7 +132,7 @@ class StatusFile:
     def __init__(self, out: Path, require_lock: Callable[[], None] = lambda: None, **values: Any) -> None:
         """require_lock: raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
-        self.lost: OutputError | None = None  # the error that `require_lock` raised
+        self.lock_error: OutputError | None = None  # the error that `require_lock` raised
         self._require_lock = require_lock
         now = time.time()
         old_status = read_status(out)
@@ -169,14 +169,14 @@ class StatusFile:
         try:
             self._require_lock()
         except OutputError as error:
-            self.lost = error
-        if self.lost:
-            raise self.lost
+            self.lock_error = error
+        if self.lock_error:
+            raise self.lock_error
 
     def note(self, **values: Any) -> None:
         """Set fields, which the next heartbeat writes.  Raises OutputError if another run has taken over the folder."""
-        if self.lost:
-            raise self.lost
+        if self.lock_error:
+            raise self.lock_error
         with self._state_lock:
             self.now = self.now.model_copy(update={"changed": time.time(), **values})
 
@@ -201,7 +201,7 @@ class StatusFile:
 
     def count(self, unit: str, done: int, total: int, **values: Any) -> None:
         """Set the progress of the stage and other fields.  unit: what is counted, in words."""
-        self.note(progress=Amount(done=done, total=total, unit=unit), **values)
+        self.note(progress=StageProgress(done=done, total=total, unit=unit), **values)
 
     def counted(self, items: Iterable[Item], unit: str, total: int) -> Iterator[Item]:
         """Yield the items and report the progress.  An item is done when the next one is requested."""
@@ -237,7 +237,7 @@ class StatusFile:
                 if not self._ended.is_set() and os.path.isdir(self.out):  # do not recreate a removed folder
                     self._write()
             except (OutputError, OSError) as error:
-                if not self._warned and not self.lost:
+                if not self._warned and not self.lock_error:
                     LOG.warning("%s; the run continues", error)
                 self._warned = True
 

@@ -102,7 +102,7 @@ def _with_fewer_steps(settings: PipelineFile, fraction: Fraction) -> PipelineFil
     def with_rates(training: Optimize) -> Optimize:
         if training.update != "all":  # Gaussians outside the view keep their moments
             return training
-        return training.model_copy(update={"rates": training.rates.times(float(fraction) ** -0.5)})
+        return training.model_copy(update={"rates": training.rates.scale(float(fraction) ** -0.5)})
 
     return map_trainings(stretch(settings, fraction), Optimize, with_rates)
 

@@ -132,7 +132,7 @@ def test_every_exception_is_one_line_with_a_code(raised, in_thread, monkeypatch,
     assert ("run with --debug" in line) == (code == 1)
 
 
-NO_PATHS = {"lower_rate(run, broken)", "2 * state.stage_step", "2 * metrics['steps']", "pipeline"}
+NO_PATHS = {"suggest_rate(run, broken)", "2 * state.stage_step", "2 * metrics['steps']", "pipeline"}
 
 
 def test_path_in_a_command_is_one_shell_word():

@@ -111,9 +111,9 @@ def test_damaged_records_are_read_or_refused(folder: Path):
     @fuzzed(data=damaged([LINES], ["null\n", '{"step": true, "kind": "x"}\n']))
     def reads(data):
         records.path.write_bytes(data)
-        records.lines = 1
+        records.line_count = 1
         if outcome(records.read) is not None:
             records.start()
-            assert len(records.read()) == records.lines <= 1
+            assert len(records.read()) == records.line_count <= 1
 
     reads()

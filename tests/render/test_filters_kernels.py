@@ -130,7 +130,7 @@ def test_specks_keep_their_brightness_when_zoomed_out(device):
 
 def test_screen_filter_with_a_key_without_effect_is_refused():
     count = len(Settings.subclasses)
-    with pytest.raises(ConfigError, match=r"Wide: its key 'radius' has no effect; override ScreenFilter.numbers"):
+    with pytest.raises(ConfigError, match=r"Wide: its key 'radius' has no effect; override ScreenFilter.parameters"):
 
         class Wide(ScreenFilter):
             radius: float = 2.0
@@ -141,8 +141,8 @@ def test_screen_filter_with_a_key_without_effect_is_refused():
         compensate: Literal[0] = 0
         radius: float = 2.0
 
-        def numbers(self) -> tuple[float, float, float]:
+        def parameters(self) -> tuple[float, float, float]:
             return self.radius**2, 0.0, 0.0
 
     del Settings.subclasses[count:]
-    assert Broad().numbers() == (4.0, 0.0, 0.0)
+    assert Broad().parameters() == (4.0, 0.0, 0.0)

@@ -106,7 +106,7 @@ def test_heartbeat_stops_and_reports_a_lost_folder(tmp_path, monkeypatch, caplog
     monkeypatch.setattr(writing, "BEAT", 0.002)
     with run_folder.open_run_folder(RunState.read(tmp_path / "run"), "new") as status:
         before = take_folder(tmp_path / "run")
-        while status.lost is None:
+        while status.lock_error is None:
             time.sleep(0.001)
         with pytest.raises(OutputError, match=GONE):
             status.note(step=1)  # as a training does at each step

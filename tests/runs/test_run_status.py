@@ -10,7 +10,7 @@ import pytest
 
 from clsplat.runs import status as reading
 from clsplat.runs.state import RunState
-from clsplat.training.status import Amount, StatusFile
+from clsplat.training.status import StageProgress, StatusFile
 from tests.support.refusals import refusal
 from tests.support.runs import write_status
 
@@ -50,7 +50,7 @@ def test_stopped_process_has_no_heartbeat(tmp_path):
 
 
 def test_status_prints_stage_and_time_left(tmp_path):
-    amount = Amount(done=3, total=20, unit="views")
+    amount = StageProgress(done=3, total=20, unit="views")
     status = write_and_read_status(
         tmp_path, host="a", time=time.time(), stage="evaluate", progress=amount, seconds_left=71.6
     )

@@ -5,7 +5,7 @@ import numpy as np
 from clsplat.conformance import reference as ref
 from clsplat.conformance.scenes import random_case
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.stages.palette import average_clusters, most_alike, set_clusters
+from clsplat.stages.palette import average_clusters, find_most_similar, set_clusters
 from tests.support.devices import each_once, on_devices, on_one_setting
 
 
@@ -13,10 +13,10 @@ from tests.support.devices import each_once, on_devices, on_one_setting
 def test_vector_with_the_largest_product_is_found_in_blocks(device, rng, count, entries, monkeypatch):
     points, vectors = (rng.normal(size=(rows, 165)).astype(np.float32) for rows in (count, entries))
     products = points.astype(np.float64) @ vectors.T.astype(np.float64)
-    whole = most_alike(device, points, vectors)
+    whole = find_most_similar(device, points, vectors)
     np.testing.assert_allclose(products[np.arange(count), whole], products.max(axis=1), rtol=1e-5)
     monkeypatch.setattr("clsplat.stages.palette.BLOCK", 64)
-    np.testing.assert_array_equal(most_alike(device, points, vectors), whole)
+    np.testing.assert_array_equal(find_most_similar(device, points, vectors), whole)
 
 
 def clustered(device, rng, count: int, clusters: int) -> tuple[Gaussians, np.ndarray, np.ndarray]:

@@ -68,7 +68,7 @@ def test_palette_refinement_lowers_the_visible_error(visibility, rng):
         return (points.astype(np.float64) @ vectors.T.astype(np.float64)).argmax(axis=1)
 
     first = rest[:8].astype(np.float64)
-    vectors, labels = result.palette(rest, first, nearest=most_alike)
+    vectors, labels = result.improve_palette(rest, first, nearest=most_alike)
     assert error_with(vectors) < 0.8 * error_with(first)
     left = rest - vectors[labels]
     assert (result.gradient(left) * left).sum() == pytest.approx(error_with(vectors), rel=1e-4), "each has its best one"

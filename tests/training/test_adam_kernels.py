@@ -244,7 +244,7 @@ def test_rows_without_an_average_keep_their_values(device, rng):
     gaussians = random_case(rng, 20).model(device).gaussians
     before = {name: gaussians.get(name) for name in gaussians.tables}
     average.attach_average(gaussians)
-    average.take_average(gaussians)
+    average.apply_average(gaussians)
     assert gaussians.tables.keys() == before.keys()
     for name in PARAMETERS:
         np.testing.assert_array_equal(gaussians.get(name), before[name])
@@ -255,7 +255,7 @@ def test_empty_model(device, rng):
     gaussians = random_case(rng, 0).model(device).gaussians
     average.attach_average(gaussians)
     average.add_to_average(gaussians)
-    average.take_average(gaussians)
+    average.apply_average(gaussians)
     assert gaussians.count == 0
 
 
@@ -267,7 +267,7 @@ def test_average_of_equal_values_is_the_value(device, rng):
     average.attach_average(gaussians)
     for _ in range(7):
         average.add_to_average(gaussians)
-    average.take_average(gaussians)
+    average.apply_average(gaussians)
     for name in PARAMETERS:
         np.testing.assert_array_equal(gaussians.get(name), before[name])
 
@@ -279,7 +279,7 @@ def test_nan_stays_in_its_row(device, rng):
     gaussians.set("means", means)
     average.attach_average(gaussians)
     average.add_to_average(gaussians)
-    average.take_average(gaussians)
+    average.apply_average(gaussians)
     result = gaussians.get("means")
     assert np.isnan(result[3]).all()
     assert np.isfinite(np.delete(result, 3, axis=0)).all()

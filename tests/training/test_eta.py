@@ -4,7 +4,7 @@ import pytest
 
 from clsplat.core.progress import Progress
 from clsplat.core.terminal import progress_line
-from clsplat.training.records import VIEWS, Forecast
+from clsplat.training.records import PSNR_REPORTS, Forecast
 
 LAST, GROWTH_END = 3000, 1600
 
@@ -59,6 +59,6 @@ def test_growth_ends_with_the_last_edit():
 
 def test_psnr_is_the_mean_over_the_last_views():
     forecast = Forecast(LAST, 0)
-    for number in range(VIEWS + 3):
+    for number in range(PSNR_REPORTS + 3):
         forecast.add(number, float(number), 1, 1.0)
-    assert forecast.psnr == pytest.approx(3 + (VIEWS - 1) / 2)
+    assert forecast.psnr == pytest.approx(3 + (PSNR_REPORTS - 1) / 2)

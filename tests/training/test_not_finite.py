@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import NumericError
 from clsplat.density.statistics import SplatStats
-from clsplat.training.checkpoint import lower_rate
+from clsplat.training.checkpoint import suggest_rate
 from clsplat.training.run import Run
 from tests.support.runs import FEW, digest, steps_saved, train
 
@@ -83,12 +83,12 @@ def test_advice_after_a_nonfinite_state_works(tiny_scene, tmp_path, caplog):
 
 def test_advice_names_the_training_stage(tiny_scene, tmp_path, few_steps):
     run = train(tiny_scene, tmp_path, *FEW)
-    assert lower_rate(run, ["quats"]) == "optimize.rates.quats=0.0005"
+    assert suggest_rate(run, ["quats"]) == "optimize.rates.quats=0.0005"
     stages = run.pipeline["stages"]
     run.pipeline = {**run.pipeline, "stages": [*stages[:2], *stages[1:]]}
-    assert lower_rate(run, []).startswith("stages.2.rates.")
+    assert suggest_rate(run, []).startswith("stages.2.rates.")
     run.stage_index = 1
-    assert lower_rate(run, ["sh_rest"]) == "stages.1.rates.sh_rest=5e-05"
+    assert suggest_rate(run, ["sh_rest"]) == "stages.1.rates.sh_rest=5e-05"
     run.pipeline = {**run.pipeline, "stages": [stages[0], stages[-1]]}
-    assert lower_rate(run, ["means"]) == "optimize.rates.means=1.6e-05"
-    assert lower_rate(run, ["motion"]).startswith("optimize.rates.motion.velocity=")
+    assert suggest_rate(run, ["means"]) == "optimize.rates.means=1.6e-05"
+    assert suggest_rate(run, ["motion"]).startswith("optimize.rates.motion.velocity=")

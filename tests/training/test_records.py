@@ -58,12 +58,12 @@ def test_unreadable_lines_are_reported(damage, left, tmp_path, caplog):
     lines = [json.dumps({"step": step, "kind": "train"}) + "\n" for step in range(5)]
     text = {"missing": "", "cut": "".join(lines[:2]), "changed": lines[0] + "x" + "".join(lines[1:])}[damage]
     records.path.write_text(text)
-    records.lines = 4
+    records.line_count = 4
     with caplog.at_level("WARNING"):
         records.start()
     assert f"{left} of 4 lines can be read" in caplog.text
     assert records.read() == [json.loads(line) for line in lines[:left]]
-    assert records.lines == left
+    assert records.line_count == left
 
 
 def test_lines_of_plugins_without_the_fields_are_left_out(tmp_path):

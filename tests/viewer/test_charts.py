@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from clsplat.stages.report import training_charts
-from clsplat.training.records import VIEWS, Forecast, moving_average
+from clsplat.training.records import PSNR_REPORTS, Forecast, moving_average
 from clsplat.viewer.charts import HEIGHT, Line, curve, histogram
 
 
@@ -72,7 +72,7 @@ def test_report_and_terminal_show_the_same_psnr():
         {"step": step, "split": "test", "downscale": 1.0, "psnr": psnr} for step, psnr in ((1, 20.0), (7, 31.0))
     ])  # fmt: skip
     chart = str(training_charts(SimpleNamespace(records=records, downscale=1.0))[0])
-    assert f">training views, mean of the last {VIEWS}</tspan>" in chart
+    assert f">training views, mean of the last {PSNR_REPORTS}</tspan>" in chart
     heights = [float(place.split(",")[1]) for place in re.search(r'points="([^"]+)"', chart).group(1).split()]
     low, high = heights[0], heights[1]
     steps = [(low - height) / (low - high) for height in heights]

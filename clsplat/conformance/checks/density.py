@@ -24,7 +24,7 @@ from clsplat.methods.mcmc import add_noise
 from clsplat.opencl.device import Device, constants
 from clsplat.photos.photographs import Mask, Photograph
 from clsplat.render.rasterizer import Rasterizer
-from clsplat.stages.palette import average_clusters, most_alike, set_clusters
+from clsplat.stages.palette import average_clusters, find_most_similar, set_clusters
 from clsplat.training.adam import Adam
 
 CHECKS = Checks()
@@ -258,7 +258,7 @@ def most_alike_labels(device: Device, rng: np.random.Generator) -> Results:
     for count, entries, components in ((1, 1, 3), (17, 9, 45), (130, 21, 9)):
         points, vectors = (rng.integers(-511, 512, (rows, components)).astype(np.float32) for rows in (count, entries))
         vectors[-1] = vectors[0]  # a tie, which the first wins
-        actual, expected = most_alike(device, points, vectors), (points @ vectors.T).argmax(axis=1)
+        actual, expected = find_most_similar(device, points, vectors), (points @ vectors.T).argmax(axis=1)
         yield match("most_alike", f"labels of {count} points and {entries} vectors", actual, expected)
 
 

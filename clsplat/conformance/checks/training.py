@@ -235,7 +235,7 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
     for value in (np.nan, np.inf, -np.inf):
         case = random_case(rng, 65)
         case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
-        actual = case.model(device).gaussians.not_finite()
+        actual = case.model(device).gaussians.nonfinite_tables()
         wrong_names = {"quats", "sh_rest"} ^ set(actual)
         yield Deviation("count_not_finite", f"tables with {value}", len(wrong_names), 0, counts=True)
 
@@ -329,7 +329,7 @@ def check_average(device: Device, rng: np.random.Generator, count: int) -> Resul
             gaussians.rearrange(device.upload(source), device.upload(fresh), count)
     for name in PARAMETERS:
         gaussians.set(name, steps[0][name])
-    adam.take_average(gaussians)
+    adam.apply_average(gaussians)
     for name in PARAMETERS:
         values = np.stack([parameters[name].astype(np.float64) for parameters in steps])
         expected = values.mean(axis=0)

@@ -18,7 +18,7 @@ from clsplat.pipeline.file import SceneSettings
 from clsplat.runs.results import Points, RunFolder, RunMetrics
 from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing_keys
 from clsplat.sweeps.compare.crops import ImageCrop, find_crops
-from clsplat.training.records import VIEWS, moving_average
+from clsplat.training.records import PSNR_REPORTS, moving_average
 from clsplat.viewer.charts import COLORS, Line, curve
 
 # The tables: metrics and costs, means over scenes, differing settings.
@@ -247,7 +247,7 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
             f"test PSNR over CPU seconds of training, dB{suffix}",
             lines(lambda run: run.over_cpu_seconds(test_points(run))),
         ),
-        curve(f"training PSNR over steps, mean of {VIEWS} views, dB{suffix}", lines(training_points)),
+        curve(f"training PSNR over steps, mean of {PSNR_REPORTS} views, dB{suffix}", lines(training_points)),
         curve(f"Gaussians over steps{suffix}", lines(lambda run: run.points("train", "gaussians"))),
     ]
     return mark_charts_safe(charts + _size_charts(rows, "test") + _size_charts(rows, "train"))
