@@ -68,7 +68,7 @@ def fetch_package(name: str, version: str, sha256: str, folder: Path) -> Path:
 def find_source(name: str) -> WebArchive:
     """Return the dataset with this name.  Raises ConfigError if the name is unknown."""
     if name not in SOURCES:
-        raise ConfigError(f"no dataset is named '{name}'; use one of {', '.join(SOURCES)}, or pass --url")
+        raise ConfigError(f"no dataset is named '{name}'; use one of {', '.join(SOURCES)}, or the URL of an archive")
     return SOURCES[name]
 
 
@@ -105,8 +105,8 @@ def _download(source: WebArchive, archive: Path, report: Report) -> None:
         except (urllib.error.URLError, TimeoutError, ConnectionError, _IncompleteError) as error:
             if attempt == MAX_TRIES:
                 raise DataError(
-                    f"{source.url}: the connection failed {MAX_TRIES} times ({error}); run it again to continue from "
-                    f"{part.stat().st_size if part.exists() else 0} bytes"
+                    f"{source.url}: the connection failed {MAX_TRIES} times ({error}); run the command again to "
+                    f"continue from {part.stat().st_size if part.exists() else 0} bytes"
                 ) from error
             time.sleep(PAUSE)
     digest = sha256(part)
@@ -197,7 +197,7 @@ def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], Binary
 def _checked_path(archive: Path, name: str) -> PurePosixPath:
     path = PureWindowsPath(name)
     if path.anchor or ".." in path.parts or not path.parts:
-        raise DataError(f"{archive}: contains a file '{name}' outside its folder; do not trust it")
+        raise DataError(f"{archive}: contains a file '{name}' outside its folder; download it from another source")
     return PurePosixPath(*path.parts)
 
 
@@ -207,7 +207,7 @@ def _copy(stream: BinaryIO, file: BinaryIO, size: int, archive: Path) -> None:
     while chunk := stream.read(min(CHUNK, remaining + 1)):
         remaining -= len(chunk)
         if remaining < 0:
-            raise DataError(f"{archive}: a file is larger than declared; do not trust it")
+            raise DataError(f"{archive}: a file is larger than declared; download it from another source")
         try:
             file.write(chunk)
         except OSError as error:

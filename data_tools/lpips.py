@@ -135,10 +135,10 @@ class Graph:
         self._nodes: list[bytes] = []
         self._constants: dict[str, bytes] = {}
 
-    def add(self, kind: str, *inputs: str, **attributes: Sequence[int]) -> str:
+    def add(self, operator: str, *inputs: str, **attributes: Sequence[int]) -> str:
         """Add an operator, and return the name of its output."""
-        output = f"{kind}_{len(self._nodes)}"
-        names: list[Field] = [*((1, name) for name in inputs), (2, output), (3, output), (4, kind)]
+        output = f"{operator}_{len(self._nodes)}"
+        names: list[Field] = [*((1, name) for name in inputs), (2, output), (3, output), (4, operator)]
         lists = [_message((1, key), *((8, value) for value in values), (20, 7)) for key, values in attributes.items()]
         self._nodes.append(_message(*names, *((5, data) for data in lists)))
         return output

@@ -102,7 +102,7 @@ def is_complete(out: Path, options: SyntheticOptions) -> bool:
 
 
 def write_files(out: Path, options: SyntheticOptions, workers: int) -> int:
-    """Write images, cameras and points into `out`; return the number of points."""
+    """Write images, cameras, and points into `out`; return the number of points."""
     splits = options.poses()
     jobs = [(split, i, pose) for split, poses in splits.items() for i, pose in enumerate(poses)]
     world = options.world

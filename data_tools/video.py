@@ -40,7 +40,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     """
     settings: dict[str, Any] = {"video": sha256(video, "a video"), "frames": frames, "long_side": long_side}
     remove_partial_files(out, marker=PIPELINE)
-    frame_indices = _read_chosen_frames(out, settings)
+    frame_indices = _read_frame_indices(out, settings)
     if frame_indices is None:
         LOG.info("%s: looking for sharp frames", video)
         sharpnesses, motions = _measure_frames(video)
@@ -51,20 +51,20 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
         write_text(out / RECORD, json.dumps({**settings, "chosen": frame_indices}) + "\n")
     files = {index: _file(out, i) for i, index in enumerate(frame_indices, 1)}
     counter = ItemCounter("frames written", len(files))
-    missing = {index for index, path in files.items() if not _is_readable(path)}
-    for index, image in enumerate(decode_frames(video) if missing else ()):
-        if index in missing:
+    missing_indices = {index for index, path in files.items() if not _is_readable(path)}
+    for index, image in enumerate(decode_frames(video) if missing_indices else ()):
+        if index in missing_indices:
             write_image(files[index], np.ascontiguousarray(limit_size(image, long_side)[:, :, ::-1]))
-            missing.remove(index)
+            missing_indices.remove(index)
             counter.reach(counter.done + 1)
-    if missing:
-        raise DataError(f"{out / RECORD}: lists frame {min(missing)}, which is not in the video; remove {out}")
+    if missing_indices:
+        raise DataError(f"{out / RECORD}: lists frame {min(missing_indices)}, which is not in the video; remove {out}")
     if times:
         write_times(out, {path.name: index for index, path in files.items()})
     return len(files)
 
 
-def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None:
+def _read_frame_indices(out: Path, settings: dict[str, Any]) -> list[int] | None:
     """Return the frame indices that an earlier call with the same settings chose, or None.
 
     Raises DataError if the folder contains frames of another video or of other settings, or other images.
@@ -82,9 +82,9 @@ def _read_chosen_frames(out: Path, settings: dict[str, Any]) -> list[int] | None
             "folder, or remove it"
         )
     count = len(frame_indices) if frame_indices else settings["frames"] if record else 0
-    expected = {_file(out, i) for i in range(1, count + 1)}
+    expected_files = {_file(out, i) for i in range(1, count + 1)}
     other_images = sorted(
-        path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in expected
+        path for path in out.rglob("*") if is_image(path) and path.name[0] != "." and path not in expected_files
     )
     if other_images:
         raise DataError(
@@ -97,11 +97,11 @@ def _file(out: Path, number: int) -> Path:
     return out / f"frame_{number:05d}.png"
 
 
-def _are_frame_indices(chosen: Any) -> bool:
-    """Return whether `chosen` is a non-empty list of increasing frame indices."""
-    if not isinstance(chosen, list) or not all(type(index) is int and index >= 0 for index in chosen):
+def _are_frame_indices(indices: Any) -> bool:
+    """Return whether a value is a non-empty list of increasing frame indices."""
+    if not isinstance(indices, list) or not all(type(index) is int and index >= 0 for index in indices):
         return False
-    return bool(chosen) and sorted(set(chosen)) == chosen
+    return bool(indices) and sorted(set(indices)) == indices
 
 
 def _is_readable(path: Path) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 import clsplat
 
 
-def edges(image, photograph):
+def edge_loss(image, photograph):
     """Return the mean absolute difference of the image gradients, and its derivative with respect to `image`.
 
     image, photograph: [height, width, 3] float32.
@@ -22,7 +22,7 @@ def edges(image, photograph):
 
 def main(scene: str, pipeline: str = "splat_7k") -> None:
     trainer = clsplat.Trainer(scene, pipeline)
-    trainer.add_loss(edges, weight=0.1)
+    trainer.add_loss(edge_loss, weight=0.1)
     for report in trainer.steps():
         if report.step % 100 == 0:
             print(f"step {report.step}: loss {report.loss:.4f}, {report.gaussians:,} Gaussians")

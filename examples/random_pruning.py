@@ -34,5 +34,5 @@ class CapSize(Scheduled):
 
     def run(self, run: Run) -> None:
         log_scales = run.model.gaussians.get("log_scales")
-        largest = np.log(at_step(self.max_size, run.step) * run.scene.extent)
-        run.model.gaussians.set("log_scales", np.minimum(log_scales, largest).astype(np.float32))
+        max_log_scale = np.log(at_step(self.max_size, run.step) * run.scene.extent)
+        run.model.gaussians.set("log_scales", np.minimum(log_scales, max_log_scale).astype(np.float32))

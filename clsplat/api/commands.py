@@ -108,9 +108,9 @@ def status(folder: PathLike) -> dict[str, Any]:
     The store of a sweep has `cells`, the `counts` of cells by state, and `events`.  A scene that is trained in blocks
     has `state` and `parts`.
     """
-    from clsplat.workflows.folder import parse_status
+    from clsplat.workflows.folder import read_status
 
-    return parse_status(Path(folder))
+    return read_status(Path(folder))
 
 
 def status_schema() -> dict[str, Any]:
@@ -264,7 +264,7 @@ def compress_model(
     keeps = compress.KEEPS if keep is None else keep
     folder = Path(out)
     return compress.compress(
-        Path(model), to_path(scene), target, folder, form=format, keeps=keeps, steps=steps, device=device
+        Path(model), to_path(scene), target, folder, file_format=format, keeps=keeps, steps=steps, device=device
     )
 
 
@@ -292,11 +292,11 @@ def write_levels(
     Returns `folder`, `bytes`, `split` (the views that were measured), and `levels`.  Each level has `gaussians`,
     `bytes`, `merged_psnr` (dB, before training), and `psnr` (dB).
     """
-    from clsplat.workflows.lod import LodPlan, levels_of_detail
+    from clsplat.workflows.lod import LodPlan, build_levels
 
     load_plugins()
     plan = LodPlan(levels, keep, steps, downscale)
-    return levels_of_detail(Path(model), Path(folder), to_path(scene), plan, device)
+    return build_levels(Path(model), Path(folder), to_path(scene), plan, device)
 
 
 # Training a large scene in blocks.

@@ -71,7 +71,7 @@ class Commands(TyperGroup):
             best = SYNONYMS.get(name) or next(iter(difflib.get_close_matches(name, self.list_commands(ctx), n=1)), None)
             if best is None and name in self.get_command(ctx, "data").commands:
                 best = f"data {name}"
-            hint = f"did you mean '{best}'?" if best else "`clsplat --help` lists them"
+            hint = f"did you mean '{best}'?" if best else "`clsplat --help` lists the commands"
             raise ConfigError(f"no command '{name}'; {hint}")
         return super().resolve_command(ctx, args)
 
@@ -93,7 +93,7 @@ app = typer.Typer(
     epilog=examples(
         "clsplat devices",
         "clsplat run quickstart --scene my_scene",
-        "clsplat run photos --scene folder_of_photographs",
+        "clsplat run photos --scene my_photos",
     ),
     invoke_without_command=True,
     pretty_exceptions_enable=False,
@@ -125,7 +125,7 @@ def common(
         str | None, typer.Option(metavar="NAME", help="OpenCL device for commands that take --device.")
     ] = None,
     debug: Annotated[
-        bool, typer.Option("--debug", help="Show tracebacks and every log line; also after the command.")
+        bool, typer.Option("--debug", help="Show tracebacks and every log line; works after the command, too.")
     ] = False,
     plugin: Annotated[
         list[Path] | None,

@@ -1,4 +1,4 @@
-"""Define the commands that create, prepare and download datasets: `clsplat data COMMAND …`."""
+"""Define the commands that create, prepare, and download datasets: `clsplat data COMMAND …`."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -45,11 +45,11 @@ def photos(
     matching: Annotated[Matching, typer.Option(help="Which pairs of photos to match.")] = "auto",
     mapper: Annotated[Mapper, typer.Option(help="Mapping method.")] = "incremental",
 ) -> None:
-    """Find the cameras of photographs by structure from motion, and write a COLMAP folder."""
+    """Find the cameras of photos by structure from motion, and write a COLMAP folder."""
     from clsplat.prepare.cache import place_photographs
 
     count = place_photographs(source, out, long_side, camera_model, matching, mapper)
-    print(f"{count} photos placed, a COLMAP folder in {out}")
+    print(f"{count} photos placed; the COLMAP folder is {out}")
 
 
 @app.command()
@@ -79,7 +79,7 @@ def undistort(
         UndefinedPixels, typer.Option(help="Crop away pixels that no photo covers, or keep and mask them.")
     ] = "crop",
 ) -> None:
-    """Undistort the photographs of a scene, including those of fisheye lenses."""
+    """Undistort the photos of a scene, including those of fisheye lenses."""
     from clsplat.prepare.undistort import undistort_scene
 
     print(f"{undistort_scene(scene, out, long_side, undefined_pixels)} images in {out}")

@@ -15,12 +15,12 @@ from clsplat.core.files import path_exists
 from clsplat.core.text_table import text_table
 
 
-def _parse_numbers(option: str, text: str | None, expected: str) -> list[float] | None:
+def _parse_numbers(option: str, text: str | None, description: str) -> list[float] | None:
     """Parse the comma-separated numbers of an option.  Raises ConfigError."""
     try:
         return None if text is None else [float(part) for part in text.split(",")]
     except ValueError:
-        raise ConfigError(f"{option} {quote(text)}: expected {expected}") from None
+        raise ConfigError(f"{option} {quote(text)}: expected {description}") from None
 
 
 @command(
@@ -34,7 +34,7 @@ def evaluate(
     downscales: Annotated[
         str | None,
         typer.Option(
-            metavar="N,…", help="Divisors of the image size; default: that of the run, or 1 for a model file."
+            metavar="N,…", help="Divisors of the image size; default: the divisor of the run, or 1 for a model file."
         ),
     ] = None,
     metrics: Annotated[
@@ -133,7 +133,7 @@ def convert(
     ],
     sh_degree: Annotated[int | None, typer.Option(metavar="N", help="Highest SH degree to keep.")] = None,
     quality: Annotated[
-        Literal["small", "balanced", "high"], typer.Option(help="SPZ, SOG: precision of the values.")
+        Literal["small", "balanced", "high"], typer.Option(help="Precision of the values in SPZ and SOG files.")
     ] = "balanced",
     crop: Annotated[
         str | None,
@@ -155,7 +155,7 @@ def convert(
     ] = None,
     world: Annotated[bool, typer.Option("--world", help="Write world coordinates, without an origin.")] = False,
 ) -> None:
-    """Convert models to another format: PLY, SPZ, SOG, glTF and others."""
+    """Convert models to another format: PLY, SPZ, SOG, glTF, and others."""
     result = commands.convert(
         files[:-1],
         files[-1],
@@ -202,7 +202,7 @@ def compress(
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Prune, train and quantize a model to meet a target size or quality; each file is measured as written."""
+    """Prune, train, and quantize a model to meet a target size or quality; each file is measured as written."""
     from clsplat.workflows.compress import table
 
     keeps = _parse_numbers("--keep", keep, "fractions, separated by commas, such as 1,0.7,0.5")
@@ -230,7 +230,7 @@ def lod(
     ] = None,
     downscale: Annotated[
         float | None,
-        typer.Option(metavar="N", help="Divisor of the image size for this training; default: that of the run."),
+        typer.Option(metavar="N", help="Divisor of the image size for this training; default: the divisor of the run."),
     ] = None,
     device: DeviceOption = None,
 ) -> None:
@@ -265,7 +265,7 @@ def compare(
 ScaleOption = Annotated[
     float | None,
     typer.Option(
-        min=1, metavar="N", help="Divisor of the image size; default: that of the run, or 1 for a model file."
+        min=1, metavar="N", help="Divisor of the image size; default: the divisor of the run, or 1 for a model file."
     ),
 ]
 PathOption = Annotated[
@@ -281,7 +281,7 @@ SideOption = Annotated[
 FormatOption = Annotated[Literal["png", "npy"], typer.Option("--format", help="8-bit images or float32 arrays.")]
 SizeOption = Annotated[
     str | None,
-    typer.Option(metavar="WxH", help="Video: size of a frame in pixels, even numbers; default: that of the photos."),
+    typer.Option(metavar="WxH", help="Video: even frame size in pixels; default: the size of the photos."),
 ]
 DepthOption = Annotated[
     Literal["mean", "median"] | None,

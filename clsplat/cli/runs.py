@@ -12,7 +12,7 @@ from clsplat.core.errors import ClsplatError, ConfigError, DataError, OutputErro
 
 OnOption = Annotated[
     Path | None,
-    typer.Option("--on", metavar="FILE", help="YAML file: where cells or blocks run (engine, store, devices)."),
+    typer.Option("--on", metavar="FILE", help="YAML file with the engine, store, and devices for cells or blocks."),
 ]
 
 
@@ -127,7 +127,7 @@ def status(
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of status.json.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the state, step and metrics of a run, or of all cells of a store, from its files."""
+    """Show the state, step, and metrics of a run, or of all cells of a store, from its files."""
     from clsplat.runs.status import status_text
     from clsplat.sweeps.status import overview_text
     from clsplat.workflows.blocks import status_table
@@ -263,7 +263,7 @@ def blocks(
     ] = "blocks_coarse",
     min_coverage: Annotated[
         float,
-        typer.Option(metavar="FRACTION", help="Fraction of a view that a block must cover to train on it."),
+        typer.Option(metavar="FRACTION", help="Fraction of a view that a block must cover to train on the view."),
     ] = 0.05,
     steps: Annotated[
         Literal["each", "shared"],
@@ -339,7 +339,7 @@ def cancel(
     cell: Annotated[str | None, typer.Argument(metavar="[CELL]", help="A cell's name or key; default: all.")] = None,
 ) -> None:
     """Ask running cells, on any machine, to save their state and stop."""
-    terminal.print_message(f"{store}: asked to stop: {commands.cancel(store, cell)}")
+    terminal.print_message(f"{store}: stop requested for {commands.cancel(store, cell)}")
 
 
 @command(
@@ -354,9 +354,9 @@ def worker(
     ] = None,
     tls_ca: Annotated[str | None, typer.Option(metavar="FILE", help="CA certificate, PEM.")] = None,
     tls_cert: Annotated[str | None, typer.Option(metavar="FILE", help="Certificate of this machine, PEM.")] = None,
-    tls_key: Annotated[str | None, typer.Option(metavar="FILE", help="Its private key, PEM.")] = None,
+    tls_key: Annotated[str | None, typer.Option(metavar="FILE", help="Private key of the certificate, PEM.")] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Without TLS: anyone who can reach the scheduler's port can run code.")
+        bool, typer.Option("--insecure", help="Skip TLS; anyone who can reach the scheduler's port can run code.")
     ] = False,
 ) -> None:
     """Offer this machine's devices to a Dask scheduler, one process per device, until the scheduler exits."""

@@ -1,4 +1,4 @@
-"""Define the commands for devices, datasets and speed."""
+"""Define the commands for devices, datasets, and speed."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -52,8 +52,8 @@ def doctor(
 
 
 POINTS_NOTE = (
-    "partitioned by the points of the dataset, for the pipeline blocks; `clsplat blocks --plan` takes other pipelines "
-    "and settings, and partitions by a coarse model that it trains"
+    "this partition is based on the points of the dataset and the pipeline `blocks`; `clsplat blocks --plan` trains a "
+    "coarse model to partition, and accepts other pipelines and settings"
 )
 
 

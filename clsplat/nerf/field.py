@@ -24,7 +24,7 @@ assert RAYS == BLOCK
 
 
 @dataclass(frozen=True)
-class Draw:
+class RandomKey:
     """The key of the random numbers for the rays of a step."""
 
     seed: int
@@ -40,7 +40,7 @@ class Rays:
     pixels: Array  # [ray_count] row * width + column
     cones: Array  # [count, RAY_VALUES]
     count: int  # including padding to whole tiles
-    draw: Draw | None  # None for evenly spaced samples
+    draw: RandomKey | None  # None for evenly spaced samples
 
     @property
     def ray_count(self) -> int:
@@ -57,7 +57,7 @@ class SampleLevel:
     raw_colors: Array  # [tiles, COLOR_ROWS, SAMPLES]
     raw_densities: Array  # [tiles, COLOR_ROWS, SAMPLES]
     weights: Array  # [count, samples]
-    left: Array  # [count, samples] transmittance behind each sample
+    transmittance: Array  # [count, samples] behind each sample
     colors: Array  # [count, 3]
 
 
@@ -70,8 +70,8 @@ class RayTarget:
     errors: Array  # [rays of the step] squared differences
 
 
-class Levels:
-    """A renderer of rays, level by level; each level can be differentiated until the next level is rendered."""
+class RayRenderer:
+    """Renders rays level by level; each level can be differentiated until the next level is rendered."""
 
     def __init__(self, workspace: Workspace, shape: FieldShape, background: Array) -> None:
         """background: [3] in [0, 1]."""
@@ -81,7 +81,7 @@ class Levels:
         self.encoding = Encoding(workspace, shape, self.network)
         self._rays, self._composite = device.program("rays.cl"), device.program("composite.cl")
 
-    def sample_rays(self, camera: DeviceCamera, draw: Draw, count: int) -> Rays:
+    def sample_rays(self, camera: DeviceCamera, draw: RandomKey, count: int) -> Rays:
         """Return `count` rays through random pixels of a camera."""
         pixels = self.workspace.array("field pixels", count, np.uint32)
         pixel_count = camera.width * camera.height
@@ -96,7 +96,7 @@ class Levels:
         )
         return self.cast(camera, pixels, draw)
 
-    def cast(self, camera: DeviceCamera, pixels: Array, draw: Draw | None = None) -> Rays:
+    def cast(self, camera: DeviceCamera, pixels: Array, draw: RandomKey | None = None) -> Rays:
         """Return the rays through pixels of a camera.  pixels: [n], row * width + column."""
         count = -(-pixels.shape[0] // RAYS) * RAYS
         cones = self.workspace.array("field cones", (count, RAY_VALUES))
@@ -135,7 +135,7 @@ class Levels:
             edges=level.edges,
             background=self.background,
             weights=level.weights,
-            left=level.left,
+            left=level.transmittance,
             colors=level.colors,
             photograph=target.photograph,
             pixels=rays.pixels,
@@ -227,9 +227,9 @@ def rays_per_pass(shape: FieldShape) -> int:
     return max(RAYS, PASS_SAMPLES // max(shape.coarse_samples, shape.fine_samples) // RAYS * RAYS)
 
 
-def _random_arguments(draw: Draw | None) -> dict[str, int]:
+def _random_arguments(draw: RandomKey | None) -> dict[str, int]:
     """Return the arguments of kernels for random or, without a key, evenly spaced sample edges."""
-    key = draw or Draw(0, 0, 0)
+    key = draw or RandomKey(0, 0, 0)
     return {"drawn": int(draw is not None), "seed": key.seed, "step": key.step, "first_ray": key.first}
 
 
@@ -239,7 +239,7 @@ class Field:
     def __init__(self, shape: FieldShape, parameters: Array, background: Array) -> None:
         """parameters: [P], changed in place by training; background: [3] in [0, 1]."""
         self.shape, self.parameters = shape, parameters
-        self.levels = Levels(Workspace(parameters.device), shape, background)
+        self.levels = RayRenderer(Workspace(parameters.device), shape, background)
 
     @classmethod
     def initial(cls, shape: FieldShape, seed: int, background: Array) -> "Field":
@@ -258,7 +258,7 @@ class Field:
         return image
 
     def render_layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
-        """Return the image, alpha and mean depth of the fine level on the host.
+        """Return the image, alpha, and mean depth of the fine level on the host.
 
         Depths are in scene units.  The direction of a ray has depth 1, so distances along it are depths.
         """

@@ -2,7 +2,7 @@
 
 parameters.npy    [P, 1] float32, the parameters in the layout of clsplat.nerf.shape
 meta.npy          JSON: `format`, the `version` that wrote it, `shape` with the keys of `train_field.field`, the
-                  `background`, the `alpha` of the photographs, and the `origin` if it is not 0
+                  `background`, the `alpha` of the photos, and the `origin` if it is not 0
 """
 
 from collections.abc import Mapping
@@ -27,10 +27,10 @@ from clsplat.scene.scene import Scene
 from clsplat.training import archive
 
 FORMAT: Final = 1
-ENDING, FILE, PARAMETERS = ".npz", "field.npz", "parameters"
+SUFFIX, FILE, PARAMETERS = ".npz", "field.npz", "parameters"
 
 
-class Notes(BaseModel):
+class Metadata(BaseModel):
     """The metadata in the file of a field."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
@@ -52,7 +52,7 @@ class FieldModel:
 
     shape: FieldShape
     parameters: NDArray[np.float32]  # [P]
-    rendering: Rendering  # background, and the meaning of the photographs' fourth channel
+    rendering: Rendering  # background, and the meaning of the photos' fourth channel
     origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of its origin
 
     def __post_init__(self) -> None:
@@ -82,7 +82,7 @@ class FieldModel:
     def save(self, path: str | Path) -> str:
         """Write the field to a file, and return the file's SHA-256.  Raises OutputError when it cannot be written."""
         path, rendering = Path(path), self.rendering
-        notes = Notes(
+        metadata = Metadata(
             format=FORMAT,
             version=__version__,
             shape=self.shape,
@@ -92,7 +92,7 @@ class FieldModel:
         origin = {"origin": self.origin.tolist()} if self.origin.any() else {}
         with open_atomic(path) as file:
             archive.write(
-                file, {**notes.model_dump(exclude={"origin"}), **origin}, [(PARAMETERS, self.parameters[:, None])]
+                file, {**metadata.model_dump(exclude={"origin"}), **origin}, [(PARAMETERS, self.parameters[:, None])]
             )
         return sha256(path)
 
@@ -102,7 +102,7 @@ class FieldModel:
 
 def is_field(path: Path) -> bool:
     """Return whether a path has the extension of a field's file."""
-    return path.suffix.lower() == ENDING
+    return path.suffix.lower() == SUFFIX
 
 
 def find_field(folder: Path) -> Path:
@@ -128,9 +128,9 @@ def load_field(path: str | Path) -> FieldModel:
 def _parse_field(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel:
     """Return the field that a file contains.  Raises DataError or ValueError."""
     if notes.get("format") != FORMAT or "shape" not in notes:
-        raise DataError(f"not a field, or of an unknown format, {quote(str(notes.get('format')))}")
+        raise DataError(f"it is not a field, or has an unknown format, {quote(str(notes.get('format')))}")
     try:
-        meta = Notes.model_validate(dict(notes))
+        meta = Metadata.model_validate(dict(notes))
     except ValidationError as error:
         first = error.errors()[0]
         raise DataError(f"metadata {'.'.join(map(str, first['loc']))}: {first['msg']}") from error

@@ -128,7 +128,7 @@ class Network:
         """Return the array of partial sums, [chunks, network_parameters].  The padding is zero."""
         return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.network_parameters))
 
-    def _apply(self, layer: DenseLayer, parameters: Array, inputs: _Table, outputs: Array, lowest: float) -> None:
+    def _apply(self, layer: DenseLayer, parameters: Array, inputs: _Table, outputs: Array, lower_bound: float) -> None:
         tiles = outputs.shape[0]
         count = tiles * self._columns * (layer.columns // BLOCK)
         self._program.dense_forward(
@@ -142,7 +142,7 @@ class Network:
             input_count=layer.rows,
             output_rows=outputs.shape[1],
             output_count=layer.columns,
-            lowest=lowest,
+            lowest=lower_bound,
             count=count,
         )
 
@@ -153,7 +153,7 @@ class Network:
         grad_outputs: Array,
         inputs: _Table,
         grad_inputs: Array,
-        lowest: float,
+        lower_bound: float,
         add: int = 0,
         row: int = 0,
     ) -> None:
@@ -172,7 +172,7 @@ class Network:
             derived_count=grad_rows,
             output_rows=output_rows,
             output_count=layer.columns,
-            lowest=lowest,
+            lowest=lower_bound,
             kept=add,
             count=count,
         )
@@ -226,7 +226,7 @@ class Samples:
         return self.edges.shape[0] * self.samples_per_ray
 
     @property
-    def tiles(self) -> int:
+    def tile_count(self) -> int:
         return self.count // SAMPLES
 
 
@@ -245,8 +245,8 @@ class Encoding:
         """Write the encoded positions and directions of samples."""
         if self.shape.grid:
             self._locate(samples)
-            self.read_grid(parameters, samples.tiles)
-        shape, (features, first) = self.shape, self.network.position(samples.tiles)
+            self.read_grid(parameters, samples.tile_count)
+        shape, (features, first) = self.shape, self.network.position(samples.tile_count)
         arguments: dict[str, Any] = {
             "items": samples.count // self._lanes,
             "cones": samples.cones,
@@ -263,7 +263,7 @@ class Encoding:
                 written=round_to_blocks(6 * shape.degrees),
                 **arguments,
             )
-        features, first = self.network.direction(samples.tiles)
+        features, first = self.network.direction(samples.tile_count)
         self._program.encode_directions(
             features=features,
             rows=features.shape[1],
@@ -326,7 +326,7 @@ class Encoding:
             items=samples.count // self._lanes,
             cones=samples.cones,
             edges=samples.edges,
-            places=self.grid_positions(samples.tiles),
+            places=self.grid_positions(samples.tile_count),
             corner_x=x,
             corner_y=y,
             corner_z=z,

@@ -1,4 +1,4 @@
-"""Describe the shape of a field: its network, encodings, samples and grid, and the layout of its parameters."""
+"""Describe the shape of a field: its network, encodings, samples, and grid, and the layout of its parameters."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
@@ -174,7 +174,7 @@ class FieldShape(Settings):
 
     @property
     def position_parts(self) -> list[int]:
-        """The numbers of features of the encoded position, from the grid and from sines, each padded to full blocks."""
+        """The numbers of features of the encoded position from the grid and from sines, without padding."""
         return [self.grid_rows, 6 * self.degrees]
 
     @property

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
-from clsplat.nerf.field import Draw, Field, RayTarget, rays_per_pass
+from clsplat.nerf.field import Field, RandomKey, RayTarget, rays_per_pass
 from clsplat.nerf.network import CHUNK, PLACE_ROWS
 from clsplat.nerf.shape import COLOR_ROWS, SAMPLES, FieldShape, GridShape, WrittenShape
 from clsplat.opencl.device import Array, constants
@@ -30,7 +30,7 @@ _WRITTEN: TypeAdapter[FieldShape] = TypeAdapter(WrittenShape)
 
 @dataclass(frozen=True)
 class RayPhotograph:
-    """A photograph of a step, on the device, and the number of rays to sample from it."""
+    """A photo of a step, on the device, and the number of rays to sample from it."""
 
     camera: DeviceCamera
     photograph: Photograph
@@ -121,7 +121,7 @@ class LearnedField(TrainedField):
         return [name for name, counter in counters.items() if counter.get_item(0) > 0]
 
     def step(self, photos: Sequence[RayPhotograph], coarse_weight: float, adam: AdamStep, seed: int, step: int) -> None:
-        """Train for one step on rays of photographs (Barron et al. 2021, section 3.3).
+        """Train for one step on rays of photos (Barron et al. 2021, section 3.3).
 
         The loss is the loss of the fine level plus `coarse_weight` times the loss of the coarse level.  Each is the
         mean squared difference of the rays, weighted by the areas of their pixels.
@@ -132,7 +132,7 @@ class LearnedField(TrainedField):
         errors = self._errors(sum(photo.rays for photo in photos))
         self._scales, first = [(photo.rays, photo.weight / total) for photo in photos], 0
         for photo in photos:
-            self._differentiate(photo, photo.weight / total, coarse_weight, Draw(seed, step, first), errors)
+            self._differentiate(photo, photo.weight / total, coarse_weight, RandomKey(seed, step, first), errors)
             first += photo.rays
         self.updates += 1
         self.update(self._gradient, adam, self.updates)
@@ -170,18 +170,18 @@ class LearnedField(TrainedField):
         return [self.field.workspace.array(f"field {name} errors", rays) for name in ("coarse", "fine")]
 
     def _differentiate(
-        self, photo: RayPhotograph, scale: float, coarse_weight: float, draw: Draw, errors: list[Array]
+        self, photo: RayPhotograph, scale: float, coarse_weight: float, draw: RandomKey, errors: list[Array]
     ) -> None:
-        """Add the gradient for the rays of one photograph, in passes."""
+        """Add the gradient for the rays of one photo, in passes."""
         levels, count = self.field.levels, rays_per_pass(self.field.shape)
         colors = photo.photograph.planes(self.field.workspace).colors
         scales = coarse_weight * scale, scale
         for first in range(0, photo.rays, count):
-            rays_draw = Draw(draw.seed, draw.step, draw.first + first)
+            rays_draw = RandomKey(draw.seed, draw.step, draw.first + first)
             rays = levels.sample_rays(photo.camera, rays_draw, min(count, photo.rays - first))
             sample_levels = levels.render(self.field.parameters, rays)
-            for level, level_scale, squares in zip(sample_levels, scales, errors, strict=True):
-                target = RayTarget(colors, level_scale, squares)
+            for level, level_scale, level_errors in zip(sample_levels, scales, errors, strict=True):
+                target = RayTarget(colors, level_scale, level_errors)
                 levels.differentiate(self.field.parameters, level, target, self._gradient)
 
 
@@ -195,7 +195,7 @@ def _parse_shape(data: Mapping[str, Any]) -> FieldShape:
 
 # The device memory that training a field needs, computed before it is allocated.
 
-TABLES_HELD = 4  # parameters, two moments of Adam, gradient
+TABLE_COUNT = 4  # parameters, two moments of Adam, gradient
 MIB = 2**20
 
 
@@ -209,14 +209,14 @@ class FieldPlan:
     photographs: int
 
     @property
-    def needed(self) -> int:
-        """Bytes in total."""
-        return TABLES_HELD * self.parameters + self.features + self.partials + self.photographs
+    def total_bytes(self) -> int:
+        """The sum of all parts."""
+        return TABLE_COUNT * self.parameters + self.features + self.partials + self.photographs
 
     def text(self, limits: DeviceLimits) -> str:
         """Return a line of text: the required memory, and the memory of the device."""
         return (
-            f"memory: {self.needed / MIB:,.0f} MiB for a field ({TABLES_HELD} tables of "
+            f"memory: {self.total_bytes / MIB:,.0f} MiB for a field ({TABLE_COUNT} tables of "
             f"{self.parameters / MIB:,.0f} MiB, "
             f"samples {(self.features + self.partials) / MIB:,.0f} MiB, photos {self.photographs / MIB:,.0f} MiB) "
             f"in {limits.memory / MIB:,.0f} MiB with buffers up to {limits.allocation / MIB:,.0f} MiB"
@@ -224,15 +224,15 @@ class FieldPlan:
 
     def check(self, limits: DeviceLimits) -> None:
         """Raise MemoryLimitError if the required memory exceeds the limits."""
-        if self.needed > limits.memory or max(self.parameters, self.partials) > limits.allocation:
+        if self.total_bytes > limits.memory or max(self.parameters, self.partials) > limits.allocation:
             raise MemoryLimitError(
-                f"{self.text(limits)}: use fewer levels or entries of the grid (train_field.field.grid), a smaller "
-                "train_field.field.width, or fewer samples"
+                f"{self.text(limits)}; this does not fit: use fewer levels or entries of the "
+                "grid (train_field.field.grid), a smaller train_field.field.width, or fewer samples"
             )
 
 
 def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
-    """Return the memory plan for training a field.  photographs: bytes of the photographs on the device."""
+    """Return the memory plan for training a field.  photographs: bytes of the photos on the device."""
     samples = rays_per_pass(shape) * max(shape.coarse_samples, shape.fine_samples)
     hidden_rows = (shape.depth + 3) * shape.width  # outputs of the trunk, and gradients of three layers
     encoded_rows = shape.position_rows + shape.grid_rows + PLACE_ROWS + shape.direction_rows
@@ -241,7 +241,7 @@ def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
     return FieldPlan(4 * shape.parameters, 4 * rows * samples, 4 * chunks * shape.network_parameters, photographs)
 
 
-# Check that photographs show the cube of a field's grid, since nothing is trained outside it.
+# Check that photos show the cube of a field's grid, since nothing is trained outside it.
 
 Floats = NDArray[np.float64]
 CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))  # the corners of a cube, [8, 3]
@@ -265,8 +265,8 @@ def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
         return
     low, high, center = (_point_text(point) for point in (corner, corner + side, scene_center(views) / unit))
     raise ConfigError(
-        f"train_field.field.grid: {fault}, {low} to {high} in units of {unit:g} scene units ({scene.path}); the "
-        f"cameras look at {center}: set `grid.corner` and `grid.side` around it, and `near` and `far`"
+        f"train_field.field.grid: {fault}; it spans {low} to {high} in units of {unit:g} scene units, and "
+        f"the cameras of {scene.path} look at {center}; set `grid.corner`, `grid.side`, `near`, and `far` to match"
     )
 
 

@@ -148,7 +148,7 @@ def _make_side(
     if name != PHOTOGRAPH:
         model = _read(Path(name))
         model = model.in_scene(scene) if scene else model.with_origin(origin)
-        return Canvas(make_painter(model, device, model.rendering.background or background)).picture
+        return Canvas(make_painter(model, device, model.rendering.background or background)).render_image
     assert scene is not None
     photo_views, extent = [view for view in scene.views if view.image_path != NO_FILE], scene.extent
     if not photo_views:

@@ -11,7 +11,7 @@ from clsplat.core.errors import ConfigError, DataError, NotFiniteError, OutputEr
 from clsplat.core.schedule import Decay, NonNegative, at_step
 from clsplat.core.settings import OneOf
 from clsplat.gaussians.model import Rendering
-from clsplat.nerf.files import ENDING, FILE, FieldModel, load_field
+from clsplat.nerf.files import FILE, SUFFIX, FieldModel, load_field
 from clsplat.nerf.shape import FieldShape
 from clsplat.nerf.training import AdamStep, LearnedField, RayPhotograph, field_plan, require_visible_grid
 from clsplat.photos.sampling import Order, Uniform, ViewPool
@@ -163,7 +163,7 @@ class ExportField(Stage):
     needs: ClassVar[frozenset[str]] = frozenset({"field"})
     output_keys: ClassVar[frozenset[str]] = frozenset({"file"})
 
-    file: Annotated[str, path_in_run(ENDING)] = FILE
+    file: Annotated[str, path_in_run(SUFFIX)] = FILE
     """Path inside the run folder; .npz."""
 
     def run(self, run: Run) -> None:

@@ -67,7 +67,7 @@ class Snapshot(Scheduled):
     def run(self, run: Run) -> None:
         view = resize_view(self._view(run), check_size(self.size) if self.size else None)
         path = run.out / self.folder / f"step_{run.step:06d}.png"
-        write_image(path, Canvas(run.painter()).picture(view))
+        write_image(path, Canvas(run.painter()).render_image(view))
         run.records.add(run.step, KIND, folder=self.folder, file=path.name)
 
 

@@ -58,7 +58,7 @@ function turned(camera, about, angle, center) {
 }
 
 // Remove the roll of a camera.
-function levelled(camera, up) {
+function leveled(camera, up) {
   const forward = axis(camera, 2), right = cross(forward, up);
   if (size(right) < 1e-3) return camera;
   const across = unit(right);

@@ -80,10 +80,10 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
     """Return a histogram as SVG, with `bins` equal intervals from zero, or "" if all values are equal."""
     if len(set(values)) < 2:
         return ""
-    largest = max(values)
+    max_value = max(values)
     counts = [0] * bins
     for value in values:
-        counts[min(bins - 1, int(bins * value / largest))] += 1
+        counts[min(bins - 1, int(bins * value / max_value))] += 1
     width, height = WIDTH - LEFT - RIGHT, HEIGHT - BOTTOM - TOP
     parts = _svg_start(title)
     y_ticks = _ticks(0, max(counts), is_integer=True)
@@ -94,9 +94,9 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
             bar = count / max(counts) * height
             corner = f'x="{LEFT + i * width / bins + 1:.1f}" y="{HEIGHT - BOTTOM - bar:.1f}"'
             parts.append(f'<rect {corner} width="{width / bins - 2:.1f}" height="{bar:.1f}" fill="{COLORS[0]}"/>')
-    x_ticks = _ticks(0, largest)
+    x_ticks = _ticks(0, max_value)
     for tick, label in zip(x_ticks, _tick_labels(x_ticks), strict=True):
-        x = LEFT + tick / largest * width
+        x = LEFT + tick / max_value * width
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{label}</text>')
     return "".join([*parts, "</svg>"])
 

@@ -106,7 +106,7 @@ class Controls {
     const action = {
       arrowleft: () => viewer.photographs.step(-1), arrowright: () => viewer.photographs.step(1),
       p: () => viewer.photographs.cycle(), r: () => viewer.reset(),
-      l: () => viewer.move(levelled(viewer.camera, viewer.up)),
+      l: () => viewer.move(leveled(viewer.camera, viewer.up)),
       o: () => viewer.panel.style(this.style === "orbit" ? "fly" : "orbit"), h: () => viewer.panel.hide(),
       g: () => viewer.panel.cameras(!viewer.frustums.shown),
       f: () => viewer.panel.fullscreen(), c: () => viewer.screenshot(), "?": () => viewer.panel.help(),

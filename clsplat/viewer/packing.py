@@ -44,7 +44,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Packed:
+class PackedModel:
     """The header and the compressed planes of a packed model."""
 
     header: dict[str, Any]
@@ -63,7 +63,7 @@ class Packed:
         return text + (f" + {faint_count:,} too faint to draw" if faint_count else "")
 
 
-def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating] | None = None) -> Packed:
+def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating] | None = None) -> PackedModel:
     """Pack a model, with the Gaussians of its sky; the same model gives the same bytes.
 
     limit: maximum number of splats, of which the most important are kept; None keeps all.  sky_center: as in
@@ -102,7 +102,7 @@ def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating
         planes.append(_motion(model.motion, model.quats))
         header["motion"] = _motion_header(model.motion.shape[1])
     data = b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)
-    return Packed(header, gzip.compress(data, 7, mtime=0))
+    return PackedModel(header, gzip.compress(data, 7, mtime=0))
 
 
 def _visible_indices(model: Model) -> NDArray[np.intp]:
@@ -144,9 +144,9 @@ def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
     low = np.minimum.reduceat(means, starts) if len(means) else np.empty((0, 3))
     high = np.maximum.reduceat(means, starts) if len(means) else np.empty((0, 3))
     blocks = np.hstack([low, (high - low) / STEPS]).astype("<f4")
-    block = blocks.astype(np.float64)[np.arange(len(means)) // BLOCK]  # rounded to float32, as the page reads them
-    steps = np.where(block[:, 3:] > 0, block[:, 3:], 1.0)
-    codes = np.rint((means - block[:, :3]) / steps).clip(0, STEPS).astype(np.uint16).T
+    bounds = blocks.astype(np.float64)[np.arange(len(means)) // BLOCK]  # rounded to float32, as the page reads them
+    steps = np.where(bounds[:, 3:] > 0, bounds[:, 3:], 1.0)
+    codes = np.rint((means - bounds[:, :3]) / steps).clip(0, STEPS).astype(np.uint16).T
     return blocks, np.concatenate([codes & 255, codes >> 8]).astype(np.uint8)
 
 
@@ -154,11 +154,11 @@ def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
     """Pack the three smallest components of unit quaternions (x, y, z, w), [N], after making the largest positive."""
     unit = np.roll(quats.astype(np.float64), -1, axis=1)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    largest, smaller = smallest_three(unit)
+    largest_index, smaller = smallest_three(unit)
     max_code = 2**BITS - 1
     codes = np.rint((smaller * np.sqrt(0.5) + 0.5) * max_code).clip(0, max_code).astype(np.uint32)
     shifts = np.array([2 * BITS, BITS, 0], np.uint32)
-    words = (codes << shifts).sum(axis=1, dtype=np.uint32) | (largest.astype(np.uint32) << np.uint32(30))
+    words = (codes << shifts).sum(axis=1, dtype=np.uint32) | (largest_index.astype(np.uint32) << np.uint32(30))
     return np.asarray(words, "<u4")
 
 
@@ -167,8 +167,8 @@ def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArra
     columns = motion.astype(np.float64)
     if (rotation := motion_fields(motion.shape[1]).get("turn")) is not None:
         unit = np.roll(quats.astype(np.float64), -1, axis=1)
-        largest = np.take_along_axis(unit, np.abs(unit).argmax(axis=1)[:, None], axis=1)
-        norm = np.linalg.norm(unit, axis=1, keepdims=True) * np.where(largest < 0, -1.0, 1.0)
+        largest_component = np.take_along_axis(unit, np.abs(unit).argmax(axis=1)[:, None], axis=1)
+        norm = np.linalg.norm(unit, axis=1, keepdims=True) * np.where(largest_component < 0, -1.0, 1.0)
         columns[:, rotation] = np.roll(columns[:, rotation], -1, axis=1) / norm
     return columns.clip(-MAX_HALF, MAX_HALF).astype("<f2").T
 
@@ -190,9 +190,9 @@ def _value_table(values: NDArray[np.floating]) -> Floats:
     return np.interp(np.linspace(0, 1, 256), position, sorted_values)
 
 
-def _quantization_table(largest: float) -> Floats:
-    """Return a table of 256 values around 0: even steps up to KNEE, then growing steps up to `largest`."""
-    values = KNEE * np.sinh(np.linspace(-1, 1, 255) * np.arcsinh(max(MIN_RANGE, largest) / KNEE))
+def _quantization_table(max_value: float) -> Floats:
+    """Return a table of 256 values around 0: even steps up to KNEE, then growing steps up to `max_value`."""
+    values = KNEE * np.sinh(np.linspace(-1, 1, 255) * np.arcsinh(max(MIN_RANGE, max_value) / KNEE))
     values[127] = 0.0
     return np.append(values, values[-1])
 

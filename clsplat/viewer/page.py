@@ -17,14 +17,14 @@ from clsplat.core.reading import read_file
 from clsplat.scene.scene import Scene, position_text
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
-from clsplat.viewer.packing import Packed
+from clsplat.viewer.packing import PackedModel
 
 
 def viewpoint_data(viewpoint: Viewpoint) -> dict[str, Any]:
     """Return the initial viewpoint of a page in the format of main.js."""
     return {
-        "pivot": float32_digits(viewpoint.pivot),
-        "up": float32_digits(viewpoint.up),
+        "pivot": round_to_float32(viewpoint.pivot),
+        "up": round_to_float32(viewpoint.up),
         "radius": viewpoint.radius,
         "focal": viewpoint.focal,
         "start": camera_data(viewpoint.start),
@@ -36,10 +36,10 @@ def camera_data(view: View) -> dict[str, Any]:
     c = view.camera
     time = {} if view.time is None else {"time": view.time}
     lens = [c.fx, c.fy, c.cx, c.cy, c.width, c.height]
-    return {"pose": float32_digits(view.world_to_camera.ravel()), "lens": lens, **time}
+    return {"pose": round_to_float32(view.world_to_camera.ravel()), "lens": lens, **time}
 
 
-def float32_digits(values: NDArray[np.floating]) -> list[float]:
+def round_to_float32(values: NDArray[np.floating]) -> list[float]:
     """Round values to nine significant digits, which identify a float32 exactly."""
     return [float(f"{value:.9g}") for value in np.asarray(values, np.float64).tolist()]
 
@@ -51,7 +51,7 @@ SCRIPTS = (
 )
 TIMESTAMPS = 31  # number of timestamps if the views of the page have fewer than two
 MAX_SIZE = 200.0  # MB; browsers need several times this in memory
-MARGIN = 0.97  # fraction of it to fill, because important splats may compress worse than the average
+MARGIN = 0.97  # fraction of MAX_SIZE to fill, because important splats may compress worse than the average
 MARK = b'<canvas id="frustums"'  # in viewer.html.j2; identifies viewer pages
 COLORS = {"black": [0, 0, 0], "white": [1, 1, 1]}
 
@@ -61,7 +61,7 @@ class Page:
     """The contents of a page: models by name, the initial viewpoint, and the views of a scene."""
 
     title: str
-    models: Mapping[str, Packed]
+    models: Mapping[str, PackedModel]
     viewpoint: Viewpoint
     background: str = "black"
     views: Sequence[dict[str, Any]] = field(default_factory=list)
@@ -112,12 +112,12 @@ class Page:
     def max_splats(self) -> int:
         """The largest number of splats per model that keeps the page below MAX_SIZE."""
         splat_size = sum(len(packed.data) * 4 / 3e6 for packed in self.models.values())
-        available = max(0.0, MAX_SIZE - (self.size - splat_size))
+        available_size = max(0.0, MAX_SIZE - (self.size - splat_size))
         low, high = 0, max(packed.count for packed in self.models.values())
         while low < high:  # a model with fewer splats keeps all of them
             count = (low + high + 1) // 2
             size = sum(len(p.data) * 4 / 3e6 * min(1, count / max(p.count, 1)) for p in self.models.values())
-            low, high = (count, high) if size <= MARGIN * available else (low, count - 1)
+            low, high = (count, high) if size <= MARGIN * available_size else (low, count - 1)
         return low
 
     def write(self, path: Path) -> None:
@@ -167,7 +167,7 @@ def style() -> str:
 # The views of a page: cameras, thumbnails, and photos within a budget of bytes.
 
 IncludedPhotos = Literal["none", "test", "all"]  # views whose photos are in the page
-THUMBNAIL, LARGEST = 128, 1000  # px, the longer side
+THUMBNAIL_SIDE, PHOTO_SIDE = 128, 1000  # px, the longer side
 BUDGET = 4.0  # MB of photos
 Image = NDArray[np.uint8]
 
@@ -189,8 +189,8 @@ def view_entries(
     for view in progress(scene.views):
         pixels, split = read(view), "test" if view.name in test_names else "train"
         is_included = included in ("all", split)
-        photograph = data_url(downscale(pixels, LARGEST)) if is_included else None
-        thumbnail = data_url(downscale(pixels, THUMBNAIL))
+        photograph = data_url(downscale(pixels, PHOTO_SIDE)) if is_included else None
+        thumbnail = data_url(downscale(pixels, THUMBNAIL_SIDE))
         views.append(
             {"name": view.name, "split": split, "thumbnail": thumbnail, "photograph": photograph, **camera_data(view)}
         )

@@ -24,6 +24,7 @@ def require_divisible(pipeline: Pipeline) -> None:
     """Raise ConfigError if a pipeline has settings that would differ between blocks, or does not start from a model."""
     settings, first_stage = pipeline.settings, pipeline.stages[0]
     optimize_stages = [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
+    modules = [module for stage in optimize_stages for module in stage.modules if "blocks" in module.conflicts]
     faults = {
         "prepare": (settings.prepare, "run it first and give its run folder as --scene"),
         "adapt": (settings.adapt, "each block would decide by its own photos; write the settings explicitly"),
@@ -34,8 +35,8 @@ def require_divisible(pipeline: Pipeline) -> None:
         "scene.validation": (settings.scene.validation != 0, "a block has no validation views; set it to 0"),
         "scene.extent": (settings.scene.extent, "blocks use the extent of the whole scene; leave it out"),
         "optimize.modules": (
-            any("blocks" in module.conflicts for stage in optimize_stages for module in stage.modules),
-            "some modules would differ between blocks; leave them out",
+            modules,
+            f"{', '.join(module.type for module in modules)} would differ between blocks; leave such modules out",
         ),
         "densify.budget": (
             any(getattr(stage.budget, "gaussians", None) for stage in _densify_stages(pipeline.stages)),

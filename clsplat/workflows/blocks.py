@@ -134,7 +134,7 @@ class Blocks:
         )
         if self.coarse_file and plan.coarse_overrides:
             raise ConfigError(
-                "--set-coarse changes the training of the coarse model; omit it, or pass a pipeline as --coarse"
+                "--set-coarse: the coarse model is already trained; omit it, or pass a pipeline as --coarse"
             )
         rasterizer = self.pipeline.settings.rasterizer
         self.device = open_verified(device, rasterizer.schedule, rasterizer.sort)
@@ -203,7 +203,7 @@ class Blocks:
                 except EmptyRegionError:
                     LOG.warning("%s: no Gaussians are left in its cell; continuing without it", block.name)
         if failures:
-            remedy = "fix that and run the same command again; finished blocks are kept"
+            remedy = "fix the cause and run the same command again; finished blocks are kept"
             coarse = shell_quote(self.out / COARSE)
             other_settings = f"other settings need another --out; --coarse {coarse} reuses the coarse model"
             summary = failures.summary(len(pipelines))
@@ -232,7 +232,7 @@ class Blocks:
         def check(number: int, means: NDArray[np.float32]) -> None:
             block, path = block_models[number]
             if not block.box.shifted(block.origin).contains(means).all():  # as the stage crop does
-                raise DataError(f"{path}: has Gaussians outside its cell; remove its folder and train it again")
+                raise DataError(f"{path}: has Gaussians outside its cell; remove its folder and run the command again")
 
         count = join_plys(file, [path for _, path in block_models], check)
         LOG.info("%s of %s merged", pluralize(count, "Gaussian"), pluralize(len(block_models), "block"))
@@ -279,18 +279,18 @@ def _coarse_file(coarse: str) -> Path | None:
 
 # Text tables of a partition and of the state of its runs.
 
-HEADINGS = ("block", "owns", "starts from", "views", "cameras inside", "pairs", "initial MiB")
+HEADINGS = ("block", "Gaussians", "initial Gaussians", "views", "cameras inside", "pairs", "initial MiB")
 TIME_HEADING = "estimated time"
-NOTE = "memory is at the start of training; times range from no growth to an estimated maximum of Gaussians"
+NOTE = "memory is at the start of training; times range from no growth to growth up to an estimated maximum"
 
 
 def table(manifest: dict[str, Any]) -> str:
     """Format a manifest as text.  MiB: device memory at the start of training.
 
-    Training times, if there are any, are ranges: from no growth to the maximum number of Gaussians.
+    Training times, if there are any, are ranges: without growth, and with the maximum number of Gaussians.
     """
     scene_row = [
-        "whole",
+        "scene",
         *[f"{manifest['gaussians']:,}"] * 2,
         str(manifest["views"]),
         "",

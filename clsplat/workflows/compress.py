@@ -84,7 +84,7 @@ EXPECTED = "expected a size such as 5MB, or a loss such as -0.1dB"
 
 
 @dataclass(frozen=True)
-class Point:
+class Entry:
     """A file of the search with its measurements."""
 
     file: str  # in the folder of the search
@@ -123,22 +123,22 @@ class CompressionTarget:
             raise ConfigError(f"--target {quote(text)}: {EXPECTED}")
         return cls(text.strip(), max_bytes=int(value * UNITS[unit]))
 
-    def is_met(self, point: Point, psnr: float) -> bool:
+    def is_met(self, entry: Entry, psnr: float) -> bool:
         """Return whether a file meets the target.  psnr: PSNR of the original model, dB."""
         if self.max_bytes is not None:
-            return point.bytes <= self.max_bytes
-        return point.psnr >= psnr + (self.psnr_change or 0)
+            return entry.bytes <= self.max_bytes
+        return entry.psnr >= psnr + (self.psnr_change or 0)
 
-    def best(self, points: Sequence[Point], psnr: float) -> Point | None:
+    def best(self, entries: Sequence[Entry], psnr: float) -> Entry | None:
         """Return the best file for a size, or the smallest for a loss; None if no file meets the target."""
-        candidates = [point for point in points if self.is_met(point, psnr)]
+        candidates = [entry for entry in entries if self.is_met(entry, psnr)]
         if self.max_bytes is not None:
-            return max(candidates, key=lambda point: (point.psnr, -point.bytes), default=None)
-        return min(candidates, key=lambda point: (point.bytes, -point.psnr), default=None)
+            return max(candidates, key=lambda entry: (entry.psnr, -entry.bytes), default=None)
+        return min(candidates, key=lambda entry: (entry.bytes, -entry.psnr), default=None)
 
-    def nearest(self, points: Sequence[Point]) -> Point:
+    def nearest(self, entries: Sequence[Entry]) -> Entry:
         """Return the file closest to the target: the smallest one for a size, or the best one for a loss."""
-        smallest, best = min(points, key=lambda point: point.bytes), max(points, key=lambda point: point.psnr)
+        smallest, best = min(entries, key=lambda entry: entry.bytes), max(entries, key=lambda entry: entry.psnr)
         return best if self.max_bytes is None else smallest
 
     @property
@@ -148,9 +148,9 @@ class CompressionTarget:
             return "give a larger size, or smaller fractions with --keep"
         return "allow a larger loss, or train longer with --steps"
 
-    def is_decided(self, rung: Sequence[Point], psnr: float) -> bool:
+    def is_decided(self, rung: Sequence[Entry], psnr: float) -> bool:
         """Return whether the search can stop, because every file of a rung is small enough, or none is good enough."""
-        results = [self.is_met(point, psnr) for point in rung]
+        results = [self.is_met(entry, psnr) for entry in rung]
         return all(results) if self.max_bytes is not None else not any(results)
 
 
@@ -159,35 +159,35 @@ class CompressionTarget:
 HEADINGS = ("Gaussians", "kept", "SH degree", "quality", "MB", "of the model", "PSNR, dB", "change, dB", "SSIM")
 
 
-def cells(point: Point, source: Point) -> list[str]:
+def cells(entry: Entry, source: Entry) -> list[str]:
     """Return the cells of the file's row in the table of results."""
     return [
-        f"{point.gaussians:,}",
-        f"{point.keep:.0%}",
-        str(point.degree),
-        point.quality or "–",
-        f"{point.bytes / 1e6:.3g}",
-        f"{point.bytes / source.bytes:.1%}",
-        f"{point.psnr:.2f}",
-        f"{point.psnr - source.psnr:+z.2f}",
-        f"{point.ssim:.4f}",
+        f"{entry.gaussians:,}",
+        f"{entry.keep:.0%}",
+        str(entry.degree),
+        entry.quality or "–",
+        f"{entry.bytes / 1e6:.3g}",
+        f"{entry.bytes / source.bytes:.1%}",
+        f"{entry.psnr:.2f}",
+        f"{entry.psnr - source.psnr:+z.2f}",
+        f"{entry.ssim:.4f}",
     ]
 
 
 def table(result: dict[str, Any]) -> str:
     """Format the record of a search as text; a star marks the chosen file."""
-    source, points = Point(**result["source"]), [Point(**point) for point in result["points"]]
-    chosen = result["chosen"] and Point(**result["chosen"])
-    marks = ["", "", *("*" if point == chosen else "" for point in points)]
-    rows = [HEADINGS, *(cells(point, source) for point in (source, *points))]
+    source, entries = Entry(**result["source"]), [Entry(**entry) for entry in result["points"]]
+    chosen = result["chosen"] and Entry(**result["chosen"])
+    marks = ["", "", *("*" if entry == chosen else "" for entry in entries)]
+    rows = [HEADINGS, *(cells(entry, source) for entry in (source, *entries))]
     return text_table([[mark, *row] for mark, row in zip(marks, rows, strict=True)])
 
 
 def page(
     target: CompressionTarget,
-    source: Point,
-    points: Sequence[Point],
-    chosen: Point | None,
+    source: Entry,
+    entries: Sequence[Entry],
+    chosen: Entry | None,
     split: str,
     scene: str,
     model: str,
@@ -200,13 +200,13 @@ def page(
         subtitle=f"{model}; PSNR and SSIM of the {split} views, measured on every file after reading it back",
         result=result,
         verdict=_verdict(target, source, chosen),
-        curves=mark_charts_safe([curve("PSNR, dB, over the file's size, MB", _lines(target, source, points))]),
+        curves=mark_charts_safe([curve("PSNR, dB, over the file's size, MB", _lines(target, source, entries))]),
         headings=HEADINGS,
-        rows=[(point.file, cells(point, source), point == chosen) for point in (source, *points)],
+        rows=[(entry.file, cells(entry, source), entry == chosen) for entry in (source, *entries)],
     )
 
 
-def _verdict(target: CompressionTarget, source: Point, chosen: Point | None) -> str:
+def _verdict(target: CompressionTarget, source: Entry, chosen: Entry | None) -> str:
     if chosen is None:
         return f"No file has met the target {target.text} so far."
     return (
@@ -215,17 +215,17 @@ def _verdict(target: CompressionTarget, source: Point, chosen: Point | None) -> 
     )
 
 
-def _lines(target: CompressionTarget, source: Point, points: Sequence[Point]) -> list[Line]:
+def _lines(target: CompressionTarget, source: Entry, entries: Sequence[Entry]) -> list[Line]:
     """Return a chart line for each fraction of the Gaussians, and a line for the target."""
-    keeps = dict.fromkeys(point.keep for point in points)
+    keeps = dict.fromkeys(entry.keep for entry in entries)
     lines = [
-        Line(sorted((p.bytes / 1e6, p.psnr) for p in points if p.keep == keep), f"{keep:.0%} of the Gaussians")
+        Line(sorted((e.bytes / 1e6, e.psnr) for e in entries if e.keep == keep), f"{keep:.0%} of the Gaussians")
         for keep in keeps
     ]
-    largest = max((point.bytes for point in points), default=0) / 1e6
-    if target.psnr_change is not None and points:
-        level = source.psnr + target.psnr_change
-        lines.append(Line([(0, level), (largest, level)], f"target {target.text}", "var(--target)", dash=1))
+    max_size = max((entry.bytes for entry in entries), default=0) / 1e6
+    if target.psnr_change is not None and entries:
+        min_psnr = source.psnr + target.psnr_change
+        lines.append(Line([(0, min_psnr), (max_size, min_psnr)], f"target {target.text}", "var(--target)", dash=1))
     return lines
 
 
@@ -246,14 +246,14 @@ class Search:
     out: Path
     target: CompressionTarget
     identity: dict[str, Any]  # inputs and options that identify the search
-    source: Point  # the original model
+    source: Entry  # the original model
     split: str  # name of the measured views
     scene: str  # name on pages
-    points: list[Point] = field(default_factory=list)
+    entries: list[Entry] = field(default_factory=list)
 
     @property
-    def chosen(self) -> Point | None:
-        return self.target.best(self.points, self.source.psnr)
+    def chosen(self) -> Entry | None:
+        return self.target.best(self.entries, self.source.psnr)
 
     def data(self) -> dict[str, Any]:
         """Return the record of the search as a dictionary for JSON."""
@@ -263,14 +263,14 @@ class Search:
             "target": self.target.text,
             "split": self.split,
             "source": asdict(self.source),
-            "points": [asdict(point) for point in self.points],
+            "points": [asdict(entry) for entry in self.entries],
             "chosen": chosen and asdict(chosen),
         }
 
     def write(self, result: str = "") -> None:
         """Write the measurements as JSON, and as an HTML page that links to the result."""
         write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
-        page_arguments = self.target, self.source, self.points, self.chosen, self.split
+        page_arguments = self.target, self.source, self.entries, self.chosen, self.split
         write_text(self.out / PAGE, page(*page_arguments, self.scene, self.identity["model"], result))
 
 
@@ -280,7 +280,7 @@ def compress(
     target: str,
     out: Path,
     *,
-    form: Format = "sog",
+    file_format: Format = "sog",
     keeps: Sequence[float] = KEEPS,
     steps: int | None = None,
     device: Any = None,
@@ -296,62 +296,62 @@ def compress(
     goal, fractions = CompressionTarget.parse(target), ordered_keeps(keeps)
     if steps is not None:
         require_steps(steps)
-    if form not in get_args(Format):
-        raise ConfigError(f"--format {quote(form)}: expected one of {', '.join(get_args(Format))}")
+    if file_format not in get_args(Format):
+        raise ConfigError(f"--format {quote(file_format)}: expected one of {', '.join(get_args(Format))}")
     input_model = ModelFile(model, scene, device)
     source, gaussians, measurer = input_model.source, input_model.gaussians, Measurer(input_model)
-    require_static(source.file, gaussians.to_splat_file(), form)
+    require_static(source.file, gaussians.to_splat_file(), file_format)
     identity: dict[str, Any] = {"model": str(source.file), "sha256": sha256(model_file(source.file))}
     identity |= {"scene": str(source.folder), "photographs": measurer.identity(), "keeps": fractions, "steps": steps}
     size = model_bytes(source.file)  # fails for a damaged model, before the folder is created
     with claim_folder(out, identity, RECORD, "a search", "another --out"):
-        warn_about_losses(_result_path(out, form), gaussians.to_splat_file())
-        original = Point(
-            source.file.name, 1, gaussians.sh_degree, "", len(gaussians), size, *measurer.figures(gaussians)
+        warn_about_losses(_result_path(out, file_format), gaussians.to_splat_file())
+        original = Entry(
+            source.file.name, 1, gaussians.sh_degree, "", len(gaussians), size, *measurer.mean_metrics(gaussians)
         )
         search = Search(out, goal, identity, original, measurer.split, source.scene_name)
         ladder = Ladder(out, Tuning("compress", source, gaussians, steps, input_model.device))
         previous = 1.0
         for keep in fractions:
-            trials = _measure_rung(ladder, ladder.train_rung(keep, previous), keep, form, measurer)
-            search.points += trials
+            trials = _measure_rung(ladder, ladder.train_rung(keep, previous), keep, file_format, measurer)
+            search.entries += trials
             search.write()
             previous = keep
             if keep < 1 and goal.is_decided(trials, original.psnr):  # a fine-tuned rung can be better than the original
                 break
-        return _write_result(search, form)
+        return _write_result(search, file_format)
 
 
-def _measure_rung(ladder: Ladder, source: Path, keep: float, form: Format, measurer: Measurer) -> list[Point]:
+def _measure_rung(ladder: Ladder, source: Path, keep: float, file_format: Format, measurer: Measurer) -> list[Entry]:
     """Write a rung with each SH setting, read the files back, and measure them."""
-    points, model = [], load(source)
-    for degree, quality in _sh_settings(form, model.sh_degree):
+    entries, model = [], load(source)
+    for degree, quality in _sh_settings(file_format, model.sh_degree):
         name = f"keep_{round(100 * keep):02d}_degree_{degree}_{quality}"
-        file = ladder.out / TRIALS / f"{name}.{form}"
-        if form == "sog":
+        file = ladder.out / TRIALS / f"{name}.{file_format}"
+        if file_format == "sog":
             _copy(ladder.train_sog(source, name, degree, quality), file)
         else:
             reduced_model = replace(model, sh_rest=with_degree(model.tables(), degree)["sh_rest"])
             reduced_model.save(file, Writing(quality=quality, quiet=True))
-        size, measurements = file.stat().st_size, measurer.figures(load(file, Reading(quiet=True)))
-        point = Point(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *measurements)
-        LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, point.psnr)
-        points.append(point)
-    return points
+        size, measurements = file.stat().st_size, measurer.mean_metrics(load(file, Reading(quiet=True)))
+        entry = Entry(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *measurements)
+        LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, entry.psnr)
+        entries.append(entry)
+    return entries
 
 
-def _sh_settings(form: Format, degree: int) -> Iterable[tuple[int, Quality]]:
+def _sh_settings(file_format: Format, degree: int) -> Iterable[tuple[int, Quality]]:
     """Return the pairs of SH degree and quality to try for a model of this degree; a single pair for degree 0."""
-    settings = ((min(limit, degree), quality) for limit, quality in SETTINGS[form])
+    settings = ((min(limit, degree), quality) for limit, quality in SETTINGS[file_format])
     return dict.fromkeys((limit, quality if limit else "balanced") for limit, quality in settings)
 
 
-def _write_result(search: Search, form: Format) -> dict[str, Any]:
+def _write_result(search: Search, file_format: Format) -> dict[str, Any]:
     """Copy the chosen file to the result path; return the record.  Raises ConfigError if no file meets the target."""
     chosen, psnr = search.chosen, search.source.psnr
-    file = _result_path(search.out, form)
+    file = _result_path(search.out, file_format)
     if chosen is None:
-        nearest = search.target.nearest(search.points)
+        nearest = search.target.nearest(search.entries)
         raise ConfigError(
             f"--target {search.target.text}: no file meets it; the closest, {search.out / nearest.file}, has "
             f"{nearest.bytes / 1e6:.3g} MB and {nearest.psnr - psnr:+z.2f} dB; {search.target.remedy}"
@@ -362,8 +362,8 @@ def _write_result(search: Search, form: Format) -> dict[str, Any]:
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
 
 
-def _result_path(out: Path, form: Format) -> Path:
-    return out / f"compressed.{form}"
+def _result_path(out: Path, file_format: Format) -> Path:
+    return out / f"compressed.{file_format}"
 
 
 def _copy(source: Path, file: Path) -> None:

@@ -57,8 +57,8 @@ class Tuning:
         """Return a pipeline of these stages of the recipe and an export.  values: settings by key path."""
         path = find(RECIPE)
         data = read_yaml(path).data
-        selected = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, "sky": "sidecar", **export}}]
-        document = Document({**data, "name": self.name, "stages": selected})
+        stage_data = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, "sky": "sidecar", **export}}]
+        document = Document({**data, "name": self.name, "stages": stage_data})
         settings = {**self._scene(), **self._rendering(), **values}
         pipeline = check_document(path, document, [f"{key}={json.dumps(value)}" for key, value in settings.items()])
         if self.steps is None:
@@ -135,7 +135,7 @@ def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
 
 
 def _shift_start(training: Any, steps: int) -> Any:
-    """Subtract `steps` from the start steps of a training stage's inner stages, given from the start of the run."""
+    """Subtract `steps` from the start steps of a training stage's inner stages, counted from the start of the run."""
     keys = training[TRAINING]
     during = [
         {name: {**inner, **({"start": inner["start"] - steps} if "start" in inner else {})}}
@@ -152,7 +152,7 @@ def _has_name(stage: Any, name: str) -> bool:
 
 # A folder in which models are trained for one set of inputs, so that interrupted work can resume.
 
-LABELS = {"sha256": "the model's bytes"}  # of keys of an identity, for messages
+LABELS = {"sha256": "the model's bytes"}  # names of identity keys in messages
 
 
 @contextmanager
@@ -203,16 +203,16 @@ def _is_leftover(name: str) -> bool:
 class Measurer:
     """Measures models at the test views of a scene, or at its training views if there are no test views."""
 
-    def __init__(self, model: ModelFile) -> None:
-        self.model_file = model
-        self.split = "test" if model.scene.split("test") else "train"
+    def __init__(self, model_file: ModelFile) -> None:
+        self.model_file = model_file
+        self.split = "test" if model_file.scene.split("test") else "train"
         if self.split == "train":
             LOG.warning(
                 "%s: has no test views, so the training views are evaluated; hold out test views with scene.holdout",
-                model.scene.path,
+                model_file.scene.path,
             )
-        self.rasterizer = Rasterizer(model.device)
-        self.photographs = Photographs(model.device, model.background)
+        self.rasterizer = Rasterizer(model_file.device)
+        self.photographs = Photographs(model_file.device, model_file.background)
 
     def identity(self) -> str:
         """Return a hash of the photos, cameras, and points.  Raises DataError if a photo is damaged."""
@@ -221,7 +221,7 @@ class Measurer:
         require_decodable(scene.path, files)
         return Identity.from_scene(scene, files).digest
 
-    def figures(self, model: Model) -> tuple[float, float]:
+    def mean_metrics(self, model: Model) -> tuple[float, float]:
         """Return the mean PSNR in dB and the mean SSIM of a model."""
         views, scene_model = self.model_file.scene.split(self.split), model.in_scene(self.model_file.scene)
         painter = SplatPainter(self.rasterizer, scene_model.upload(self.model_file.device), self.photographs.background)

@@ -26,16 +26,16 @@ def is_in_blocks(folder: Path) -> bool:
     return (folder / RECORD).is_file()
 
 
-def parse_status(folder: Path) -> dict[str, Any]:
+def read_status(folder: Path) -> dict[str, Any]:
     """Return the status of a folder that contains a scene in blocks, a sweep store, or a run.  Raises DataError."""
     if is_in_blocks(folder):
         return blocks_status(folder)
     return store_status(folder) if is_store(folder) else run_status(RunState.read(folder))
 
 
-def check(pipeline: str) -> dict[str, Any]:
+def check(target: str) -> dict[str, Any]:
     """Call `verify_blocks` for a scene in blocks, and `clsplat.runs.verify.check` otherwise."""
-    return verify_blocks(Path(pipeline)) if is_in_blocks(Path(pipeline)) else verify.check(pipeline)
+    return verify_blocks(Path(target)) if is_in_blocks(Path(target)) else verify.check(target)
 
 
 def blocks_status(out: Path) -> dict[str, Any]:

@@ -85,7 +85,7 @@ class LevelTrainer:
 
     def measure(self, model: Model) -> DetailLevel:
         """Measure the PSNR of a level without training it."""
-        psnr = self.measurer.figures(model)[0]
+        psnr = self.measurer.mean_metrics(model)[0]
         return DetailLevel(model, psnr, psnr)
 
     def train(self, number: int, model: Model) -> DetailLevel:
@@ -129,7 +129,7 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
 
 
 def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
-    """Return disjoint pairs of rows, the cheapest first.  There is at least one pair if there are two rows."""
+    """Return disjoint pairs of rows, the cheapest first.  There is at least one pair if there are at least two rows."""
     first, second = _neighbors(tables["means"])
     cost = pair_cost(tables, first, second)
     order = np.lexsort((second, first, np.where(np.isfinite(cost), cost, np.inf)))
@@ -204,7 +204,7 @@ LOG = logging.getLogger("clsplat")
 MIN_GAUSSIANS = 1_000_000  # below this, PlayCanvas recommends a single SOG
 
 
-def levels_of_detail(
+def build_levels(
     model: Path, folder: Path, scene: Path | None = None, plan: LodPlan | None = None, device: Any = None
 ) -> dict[str, Any]:
     """Write levels of detail as streamed SOG.  Returns `folder`, its `bytes`, the measured `split`, and `levels`.
@@ -221,7 +221,7 @@ def levels_of_detail(
     require_in_range(model, gaussians.to_splat_file(), "SOG")
     if len(gaussians) < MIN_GAUSSIANS:
         count = pluralize(len(gaussians), "Gaussian")
-        LOG.warning("%s: has only %s; below a million a single SOG is better: `clsplat convert`", model, count)
+        LOG.warning("%s: has only %s; below a million, a single SOG is better: use `clsplat convert`", model, count)
     trainer = LevelTrainer(photo_model, folder.with_name(f"{folder.name}.training"), plan) if photo_model else None
     with new_folder(folder) as temporary_folder:
         with trainer.lock() if trainer else nullcontext():
@@ -243,8 +243,8 @@ def _open_model(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> 
     """Return the model file, or None if it has no photos, and its Gaussians with the world filter baked in."""
     run = find_run(model) if scene is None else None
     if scene is None and run is None:
-        gaussians = _without_photos(model, plan, device, "has no known photos")
-        LOG.info("%s: no photos: levels are merged without training", model)
+        gaussians = _without_photos(model, plan, device, "its photos are unknown")
+        LOG.info("%s: its photos are unknown, so levels are merged without training", model)
         return None, gaussians
     try:
         photo_model = ModelFile(model, scene, device)
@@ -264,7 +264,7 @@ def _without_photos(model: Path, plan: LodPlan, device: Any, reason: str) -> Mod
     gaussians = load(model).baked()
     options = {"--steps": plan.steps, "--downscale": plan.downscale, "--device": device}
     if names := ", ".join(name for name, value in options.items() if value):
-        raise ConfigError(f"{model}: {reason}, which {names} needs; pass --scene, or omit {names}")
+        raise ConfigError(f"{model}: {reason}, so {names} cannot be used; pass --scene, or omit {names}")
     return gaussians
 
 
@@ -299,7 +299,7 @@ HEADINGS = ("level", "Gaussians", "MB", "PSNR, dB", "before training")
 
 
 def table(result: dict[str, Any]) -> str:
-    """Format the result of `levels_of_detail` as text."""
+    """Format the result of `build_levels` as text."""
     columns = len(HEADINGS) if result["split"] else 3
     return text_table([HEADINGS[:columns], *(_cells(level)[:columns] for level in result["levels"])])
 

@@ -39,9 +39,9 @@ class PartitionCell:
 
     def extended(self, fraction: float) -> Box:
         """Return the box extended on each side by half of `fraction` of the cell's size."""
-        step = 0.5 * fraction * self.size
-        low = [None if b is None else _round(b - margin) for b, margin in zip(self.box.low, step, strict=True)]
-        high = [None if b is None else _round(b + margin) for b, margin in zip(self.box.high, step, strict=True)]
+        margins = 0.5 * fraction * self.size
+        low = [None if b is None else _round(b - margin) for b, margin in zip(self.box.low, margins, strict=True)]
+        high = [None if b is None else _round(b + margin) for b, margin in zip(self.box.high, margins, strict=True)]
         return Box(low=low, high=high)
 
 
@@ -61,13 +61,13 @@ def assign_cells(means: NDArray[np.floating], partition: list[PartitionCell]) ->
 
     Raises DataError for means that are not finite.
     """
-    owner = np.full(len(means), -1)
+    cell_index = np.full(len(means), -1)
     for number, cell in enumerate(partition):
-        owner[cell.box.contains(means)] = number
-    if (owner < 0).any():
-        count = f"{int((owner < 0).sum()):,} of {pluralize(len(owner), 'Gaussian')}"
+        cell_index[cell.box.contains(means)] = number
+    if (cell_index < 0).any():
+        count = f"{int((cell_index < 0).sum()):,} of {pluralize(len(cell_index), 'Gaussian')}"
         raise DataError(f"{count} of the coarse model have positions that are not finite; train it again")
-    return owner
+    return cell_index
 
 
 def quantile(values: Floats, weights: Floats, fraction: float) -> float:
@@ -128,8 +128,8 @@ class Membership:
     @property
     def view_blocks(self) -> NDArray[np.bool_]:
         """Whether each view belongs to each block, [V, B]; always true for the block that covers most of the view."""
-        best = np.arange(self.coverage.shape[1]) == self.coverage.argmax(axis=1)[:, None]
-        return np.asarray(best | self.inside | (self.coverage > self.min_coverage))
+        is_best = np.arange(self.coverage.shape[1]) == self.coverage.argmax(axis=1)[:, None]
+        return np.asarray(is_best | self.inside | (self.coverage > self.min_coverage))
 
     @property
     def assignment(self) -> NDArray[np.bool_]:
@@ -159,18 +159,18 @@ def count_pairs(renders: Iterable[RenderedView], count: int, tile: int) -> Float
     return total
 
 
-def view_coverage(render: RenderedView, owner: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
+def view_coverage(render: RenderedView, cell_index: NDArray[np.int64], blocks: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the fraction of a view's pixels covered by each block, [B], and whether each Gaussian is visible, [N].
 
-    owner: the block of each Gaussian, [N].  Masked pixels do not count.
+    cell_index: the block of each Gaussian, [N].  Masked pixels do not count.
     """
     weight = render.sum(WEIGHT)
     pixels = max(int(render.counted_pixels().sum()), 1)
-    return np.bincount(owner, weight.astype(np.float64), blocks) / pixels, weight > 0
+    return np.bincount(cell_index, weight.astype(np.float64), blocks) / pixels, weight > 0
 
 
 LOG = logging.getLogger("clsplat")
-Bits = NDArray[np.bool_]
+Mask = NDArray[np.bool_]
 NEAR_CELL, GROWTH = 0.2, 0.2  # fractions of a cell's size by which it is extended, for cameras and for densification
 MIN_COVERAGE = 0.05  # fraction of a view's pixels
 
@@ -183,7 +183,7 @@ class Block:
     cell: PartitionCell
     gaussians: int  # number of the coarse model's Gaussians in its cell
     pairs: float  # fraction of all pairs
-    start: Bits  # [N] initial Gaussians: in its cell, visible in its views, or visible in no view
+    start: Mask  # [N] initial Gaussians: in its cell, visible in its views, or visible in no view
     views: list[dict[str, Any]]  # name, why, and share: the fraction of pixels covered
     memory: int  # device memory at the start, bytes
     origin: NDArray[np.floating]  # [3] world coordinates of the origin of `cell`
@@ -257,15 +257,15 @@ class Partitioner:
         means, gaussian_count = self.model.means, len(self.model)
         pairs = count_pairs(self._render(self.views), gaussian_count, int(self.device.tuning["TILE"]))
         partition_cells = cells(means, pairs, count)
-        owner = assign_cells(means, partition_cells)
-        members, is_needed = self._members(owner, partition_cells, min_coverage)
+        cell_index = assign_cells(means, partition_cells)
+        members, start_masks = self._members(cell_index, partition_cells, min_coverage)
         blocks = [
             Block(
                 number,
                 cell,
-                int((owner == number).sum()),
-                float(pairs[owner == number].sum() / (pairs.sum() or 1)),
-                start := is_needed[number] | (owner == number),
+                int((cell_index == number).sum()),
+                float(pairs[cell_index == number].sum() / (pairs.sum() or 1)),
+                start := start_masks[number] | (cell_index == number),
                 self._view_entries(members, number),
                 self._memory(int(start.sum()), np.flatnonzero(members.assignment[:, number]).tolist()),
                 self.model.origin,
@@ -276,19 +276,19 @@ class Partitioner:
         return Partition(blocks, self.model, coarse, self.extent, memory, len(self.views))
 
     def _members(
-        self, owner: NDArray[np.int64], partition: list[PartitionCell], min_coverage: float
-    ) -> tuple[Membership, Bits]:
+        self, cell_index: NDArray[np.int64], partition: list[PartitionCell], min_coverage: float
+    ) -> tuple[Membership, Mask]:
         """Return the views of each block, and a mask, [B, N], of the Gaussians visible in these views or in no view."""
         positions = np.stack([view.position for view in self.views])
         is_inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in partition], axis=1)
-        coverage, visible_in_block = np.zeros(is_inside.shape), np.zeros((len(partition), len(owner)), bool)
+        coverage, visible_in_block = np.zeros(is_inside.shape), np.zeros((len(partition), len(cell_index)), bool)
         for view, render in enumerate(self._render(self.views)):
-            coverage[view], visible = view_coverage(render, owner, len(partition))
+            coverage[view], visible = view_coverage(render, cell_index, len(partition))
             visible_in_block[Membership(coverage[[view]], is_inside[[view]], min_coverage).view_blocks[0]] |= visible
         members = Membership(coverage, is_inside, min_coverage)
         for view, block in np.argwhere(members.assignment & ~members.view_blocks):
             (render,) = self._render([self.views[view]])
-            visible_in_block[block] |= view_coverage(render, owner, len(partition))[1]
+            visible_in_block[block] |= view_coverage(render, cell_index, len(partition))[1]
         # Gaussians hidden from all views may become visible in any
         return members, visible_in_block | ~visible_in_block.any(axis=0)
 

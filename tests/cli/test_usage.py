@@ -92,7 +92,7 @@ NEAR = {
     "train": "no command 'train'; did you mean 'run'?",
     "rendr": "no command 'rendr'; did you mean 'render'?",
     "synthetic": "no command 'synthetic'; did you mean 'data synthetic'?",
-    "xyzzy": "no command 'xyzzy'; `clsplat --help` lists them",
+    "xyzzy": "no command 'xyzzy'; `clsplat --help` lists the commands",
     "run smoke --scen x": "clsplat run: no option --scen; did you mean --scene?",
     "run smoke --xyzzy": "clsplat run: no option --xyzzy; see `clsplat run --help`",
     "run": "clsplat run: missing argument 'PIPELINE'; see `clsplat run --help`",

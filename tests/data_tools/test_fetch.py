@@ -107,7 +107,7 @@ def test_partial_download_is_kept_after_retries(web, tmp_path):
     checksum = archive(folder / "d.zip")
     server.breaks = 5
     source = WebArchive(f"{address}/d.zip", "free", checksum)
-    assert "run it again to continue from 5000 bytes" in refusal(quietly, source, tmp_path / "d")
+    assert "run the command again to continue from 5000 bytes" in refusal(quietly, source, tmp_path / "d")
     assert [path.name for path in tmp_path.iterdir() if path.name != "web"] == ["d.d.zip.part"]
     quietly(source, tmp_path / "d")
     assert server.asked[-1] == "bytes=5000-"

@@ -19,7 +19,7 @@ from clsplat.formats.table import detect, model_bytes, read, write
 from clsplat.gaussians.conversion import convert
 from clsplat.gaussians.model import load
 from clsplat.gaussians.validate import examine, verdict
-from clsplat.workflows.lod import levels_of_detail
+from clsplat.workflows.lod import build_levels
 from tests.support.models import assert_close, interop, splats
 from tests.support.runs import NO_PROCESS
 
@@ -223,7 +223,7 @@ def test_values_beyond_sog_are_refused_and_boxes_stay_finite(tmp_path, rng):
     with pytest.raises(DataError, match=told):
         write_lod(tmp_path / "b", [large])
     with pytest.raises(DataError, match=told):
-        levels_of_detail(tmp_path / "a.ply", tmp_path / "b")
+        build_levels(tmp_path / "a.ply", tmp_path / "b")
     assert not (tmp_path / "b").exists()
 
 

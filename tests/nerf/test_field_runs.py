@@ -201,7 +201,7 @@ def test_field_background_shows_where_uncovered(finished, tiny_scene, device):
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"format": 2}, "not a field, or of an unknown format, '2'"),
+        ({"format": 2}, "it is not a field, or has an unknown format, '2'"),
         ({"shape": {"width": 64}}, r"parameters are not \[\d+, 1\] float32"),
         ({"background": "pink"}, "metadata background: "),
         ({"shape": {"width": None}}, "metadata shape.width: "),

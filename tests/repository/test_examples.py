@@ -68,7 +68,7 @@ def test_every_example_has_a_test():
 
 
 def test_own_loss_gradient_matches_differences(rng):
-    edges = runpy.run_path(str(EXAMPLES / "own_loss.py"))["edges"]
+    edges = runpy.run_path(str(EXAMPLES / "own_loss.py"))["edge_loss"]
     image, photograph, direction = rng.uniform(size=(3, 7, 5, 3))
     _, derivative = edges(image, photograph)
     up, down = (edges(image + sign * 1e-6 * direction, photograph)[0] for sign in (1, -1))
@@ -136,7 +136,7 @@ def test_scene_to_picture_notebook_runs(tiny_scene, folder):
             assert value._repr_png_().startswith(b"\x89PNG")
         shown.append(type(value).__name__)
     assert shown == ["Scene", "dict", "Model", "RenderResult", "RenderResult", "Model", "Model"]
-    assert clsplat.metrics.psnr(names["picture"].image, names["view"].photograph(1.0)) > 20
+    assert clsplat.metrics.psnr(names["result"].image, names["view"].photograph(1.0)) > 20
     assert Path("scene_to_picture.ply").is_file()
 
 

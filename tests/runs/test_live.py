@@ -92,7 +92,7 @@ def test_live_page_does_not_change_the_bits(live, few_steps, tiny_scene, tmp_pat
                 time.sleep(0.05)
         seen["end"] = state
 
-    live.state.pause(True)
+    live.state.set_paused(True)
     with in_background(look):
         trained(live, tiny_scene, tmp_path / "run")
         live.close()
@@ -118,7 +118,7 @@ def test_nothing_is_drawn_without_viewers(live, tiny_scene, tmp_path, monkeypatc
 
 def test_pause_ends_by_itself_when_no_page_is_open(live, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "PAUSE_TIMEOUT", 0.3)
-    live.state.pause(True)
+    live.state.set_paused(True)
     trained(live, tiny_scene, tmp_path / "run")
     assert not live.state.paused
 
@@ -130,7 +130,7 @@ def test_signal_ends_a_pause_and_saves_the_state(live, tiny_scene, tmp_path):
         client.until(lambda state: state.get("drawn") and state.get("stage") == "paused")
         os.kill(os.getpid(), signal.SIGTERM)
 
-    live.state.pause(True)
+    live.state.set_paused(True)
     with in_background(stop), pytest.raises(Interrupted, match="stopped at step 1, saved in "):
         trained(live, tiny_scene, tmp_path / "run")
 
@@ -148,7 +148,7 @@ def test_undrawable_image_is_reported_and_training_continues(live, tiny_scene, t
         assert client.json("state.json?after=0")["fault"] == "no room"
         client.get("resume")
 
-    live.state.pause(True)
+    live.state.set_paused(True)
     with in_background(look):
         trained(live, tiny_scene, tmp_path / "run")
 

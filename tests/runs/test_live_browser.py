@@ -49,7 +49,7 @@ def test_late_image_does_not_replace_a_newer_one(tmp_path):
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium: apt-get install chromium")
 def test_page_works_from_the_first_step_to_the_end(tiny_scene, tmp_path):
     with Live() as live, Browser(tmp_path / "browser", 700, 620) as browser:
-        live.state.pause(True)
+        live.state.set_paused(True)
 
         def visit():
             browser.visit(live.address)  # at rest: it shows a picture of step 1

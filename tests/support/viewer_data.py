@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.viewer.packing import BLOCK, Packed
+from clsplat.viewer.packing import BLOCK, PackedModel
 
 
 @dataclass
@@ -21,7 +21,7 @@ class Unpacked:
     motion: NDArray[np.float64]  # [N, columns]
 
 
-def unpacked(packed: Packed) -> Unpacked:
+def unpacked(packed: PackedModel) -> Unpacked:
     count, raw, place = packed.count, gzip.decompress(packed.data), 0
 
     def take(kind: str, *shape: int) -> NDArray[np.float64]:

@@ -273,7 +273,7 @@ def test_coarse_model_is_trained_if_none_is_given(tiny_scene, tmp_path):
             "model.background cannot be used with blocks: each block would learn its own",
         ),
         ("model.time={degree: 1}", "model.time cannot be used with blocks: moving Gaussians leave their cells"),
-        ("optimize.modules.exposure={}", "optimize.modules cannot be used with blocks: some modules would differ"),
+        ("optimize.modules.exposure={}", "optimize.modules cannot be used with blocks: exposure would differ"),
         ("scene.validation=4", "scene.validation cannot be used with blocks: a block has no validation views"),
         (
             "densify.inside={low: [0, null, null]}",

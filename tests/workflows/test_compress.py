@@ -24,7 +24,7 @@ from clsplat.runs import model_file, runner
 from clsplat.runs.model_file import ModelSource
 from clsplat.training.run import Run
 from clsplat.workflows import compress
-from clsplat.workflows.compress import SOG_STAGES, CompressionTarget, Ladder, Point, ordered_keeps, page, table
+from clsplat.workflows.compress import SOG_STAGES, CompressionTarget, Entry, Ladder, ordered_keeps, page, table
 from clsplat.workflows.finetune import Tuning
 from tests.support.html_page import Page
 from tests.support.runs import NO_PROCESS
@@ -34,8 +34,8 @@ pytestmark = pytest.mark.slow
 KEEP, STEPS = (1.0, 0.5), 20
 
 
-def point(size: int, psnr: float, keep: float = 0.5) -> Point:
-    return Point("a<b>.sog", keep, 3, "small", 10, size, psnr, 0.9)
+def entry(size: int, psnr: float, keep: float = 0.5) -> Entry:
+    return Entry("a<b>.sog", keep, 3, "small", 10, size, psnr, 0.9)
 
 
 @pytest.fixture(scope="module")
@@ -76,18 +76,18 @@ def test_file_is_copied_with_its_sky(few_steps, tmp_path, rng):
 
 
 def test_best_file_for_a_size_and_smallest_for_a_loss():
-    points = [point(900, 30.0), point(700, 29.95), point(500, 29.5)]
-    assert CompressionTarget.parse("800B").best(points, 30) is points[1]
-    assert CompressionTarget.parse("-0.1dB").best(points, 30) is points[1]
-    assert CompressionTarget.parse("-0.6dB").best(points, 30) is points[2]
-    assert CompressionTarget.parse("0dB").best(points, 31) is None
-    assert CompressionTarget.parse("400B").best(points, 30) is None
-    assert CompressionTarget.parse("400B").nearest(points) is points[2]
-    assert CompressionTarget.parse("0dB").nearest(points) is points[0]
+    entries = [entry(900, 30.0), entry(700, 29.95), entry(500, 29.5)]
+    assert CompressionTarget.parse("800B").best(entries, 30) is entries[1]
+    assert CompressionTarget.parse("-0.1dB").best(entries, 30) is entries[1]
+    assert CompressionTarget.parse("-0.6dB").best(entries, 30) is entries[2]
+    assert CompressionTarget.parse("0dB").best(entries, 31) is None
+    assert CompressionTarget.parse("400B").best(entries, 30) is None
+    assert CompressionTarget.parse("400B").nearest(entries) is entries[2]
+    assert CompressionTarget.parse("0dB").nearest(entries) is entries[0]
 
 
 def test_search_shrinks_until_no_file_can_be_better():
-    rung = [point(900, 30.0), point(500, 29.5)]
+    rung = [entry(900, 30.0), entry(500, 29.5)]
     assert not CompressionTarget.parse("600B").is_decided(rung, 30), "fewer Gaussians let more settings fit"
     assert CompressionTarget.parse("1kB").is_decided(rung, 30), "all fit"
     assert not CompressionTarget.parse("-0.1dB").is_decided(rung, 30)
@@ -138,13 +138,13 @@ def test_page_names_the_scene_and_links_to_the_file(searched, few_steps, tiny_sc
     assert f"<title>{tiny_scene.name} · point_cloud.ply, compressed to " in text
     assert str(few_steps / "point_cloud.ply") in text
     assert '<a href="compressed.sog">compressed.sog</a>' in text
-    before = page(CompressionTarget.parse("-1dB"), point(2000, 31), [point(900, 30.5)], None, "test", "fox", "a.ply")
+    before = page(CompressionTarget.parse("-1dB"), entry(2000, 31), [entry(900, 30.5)], None, "test", "fox", "a.ply")
     assert "<a" not in before, "as long as none is written"
 
 
 def test_names_of_files_are_escaped():
-    source = point(2000, 31)
-    text = page(CompressionTarget.parse("-1dB"), source, [point(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
+    source = entry(2000, 31)
+    text = page(CompressionTarget.parse("-1dB"), source, [entry(900, 30.5)], None, "test", "a<b>", "a<b>.ply")
     assert "a<b>" not in text
     assert "a&lt;b&gt;" in text
     assert "No file has met the target" in text

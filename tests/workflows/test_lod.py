@@ -114,12 +114,12 @@ def model_file(few_steps: Path, tmp_path: Path) -> Path:
 def test_merging_without_training_is_reported(model_file, tmp_path):
     result = CliRunner().invoke(app, ["lod", str(model_file), str(tmp_path / "site"), "--steps", "0"])
     assert result.exit_code == 0, result.output
-    assert "model.ply: no photos: levels are merged without training" in result.output
+    assert "model.ply: its photos are unknown, so levels are merged without training" in result.output
 
 
 @pytest.mark.parametrize("option", ["steps", "downscale", "device"])
 def test_options_that_need_photographs_are_refused_without_them(option, model_file, tmp_path):
-    message = rf"model\.ply: has no known photos, which --{option} needs; pass --scene, or omit --{option}$"
+    message = rf"model\.ply: its photos are unknown, so --{option} cannot be used; pass --scene, or omit --{option}$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(model_file, tmp_path / "site", **{option: STEPS})
     assert [path.name for path in tmp_path.iterdir()] == ["model.ply"]
@@ -145,7 +145,7 @@ def test_zero_steps_need_no_photographs(there, moved, tmp_path, caplog):
 
 
 def test_device_is_refused_if_the_photographs_have_moved(moved, tmp_path):
-    message = r"run: its photos cannot be read, which --device needs; pass --scene, or omit --device$"
+    message = r"run: its photos cannot be read, so --device cannot be used; pass --scene, or omit --device$"
     with pytest.raises(ConfigError, match=message):
         clsplat.write_levels(moved, tmp_path / "site", levels=2, steps=0, device="nosuch")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -269,7 +269,7 @@ def test_command_prints_a_table_and_suggests_one_file_for_few(few_steps, tmp_pat
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     text = " ".join(result.output.split())
-    assert "below a million a single SOG is better" in text
+    assert "below a million, a single SOG is better" in text
     assert "level Gaussians MB PSNR, dB before training" in text
     assert "site/lod-meta.json: " in text.replace(" /", "/")
     assert "PSNR of test views, not yet quantized" in text

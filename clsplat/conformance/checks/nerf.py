@@ -11,7 +11,7 @@ from clsplat.conformance.checks.images import to_planes
 from clsplat.conformance.reference import nerf as ref
 from clsplat.conformance.reference.training import adam_step
 from clsplat.conformance.scenes import random_case
-from clsplat.nerf.field import Draw, Field, Levels, Rays, RayTarget, SampleLevel
+from clsplat.nerf.field import Field, RandomKey, RayRenderer, Rays, RayTarget, SampleLevel
 from clsplat.nerf.network import PLACE_ROWS
 from clsplat.nerf.shape import FEATURES, SAMPLES, FieldShape
 from clsplat.nerf.training import AdamStep, LearnedField
@@ -55,7 +55,7 @@ class FieldCase:
     """A field with random parameters, and rays of a camera with a random photograph."""
 
     shape: FieldShape
-    levels: Levels
+    levels: RayRenderer
     parameters: NDArray[np.float32]
     photograph: NDArray[np.float32]  # [3, HEIGHT, WIDTH]
     planes: Array
@@ -63,7 +63,7 @@ class FieldCase:
     cones: NDArray[np.float64]  # including padding to whole tiles
 
     @classmethod
-    def sample(cls, device: Device, rng: np.random.Generator, rays: int, draw: Draw, **keys: Any) -> "FieldCase":
+    def sample(cls, device: Device, rng: np.random.Generator, rays: int, draw: RandomKey, **keys: Any) -> "FieldCase":
         """Return a case with random rays.  keys: keys of SHAPE to change, and their values."""
         shape = FieldShape.model_validate({**SHAPE.model_dump(), **keys})
         parameters = shape.initial_parameters(int(rng.integers(100)))
@@ -89,7 +89,7 @@ class FieldCase:
 
     def units(self, samples: int, kind: int) -> NDArray[np.float64]:
         """Return the random numbers for the edges of each ray, [rays, samples + 1]."""
-        draw = self.rays.draw or Draw(0, 0, 0)
+        draw = self.rays.draw or RandomKey(0, 0, 0)
         count = self.rays.count
         rays = range(draw.first, draw.first + count)
         return np.stack([ref.random_units(ray, samples + 1, kind, draw.seed, draw.step) for ray in rays])
@@ -134,7 +134,7 @@ def read_rows(table: Array, first: int, count: int) -> NDArray[Any]:
 def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
     """Compare pixels, rays, and the edges of samples, both random and evenly spaced."""
     for count in RAYS:
-        case = FieldCase.sample(device, rng, count, Draw(7, 11, 5))
+        case = FieldCase.sample(device, rng, count, RandomKey(7, 11, 5))
         pixels = ref.draw_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
         yield match("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
         yield compare_max("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
@@ -162,7 +162,7 @@ def _check_edge(case: FieldCase, label: str) -> Results:
 def encodings(device: Device, rng: np.random.Generator) -> Results:
     """Compare the encoded positions and directions, the inputs of the network."""
     for count in RAYS:
-        case = FieldCase.sample(device, rng, count, Draw(1, 2, 0))
+        case = FieldCase.sample(device, rng, count, RandomKey(1, 2, 0))
         level = next(case.levels.render(case.device_parameters, case.rays))
         position, direction = case.encode(level.edges.get())
         (table, row), (direction_table, direction_row) = (
@@ -200,14 +200,14 @@ CASES: list[tuple[int, tuple[float, float], dict[str, Any]]] = [  # tiles, range
 def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
     """Compare the positions of samples in a grid, their features, and the gradients of the grid's entries."""
     for count in RAYS:
-        case = FieldCase.sample(device, rng, count, Draw(1, 2, 0), grid=GRID)
+        case = FieldCase.sample(device, rng, count, RandomKey(1, 2, 0), grid=GRID)
         level = next(case.levels.render(case.device_parameters, case.rays))
         means, variances = case.grid_positions(level.edges.get())
         actual = read_rows(case.levels.encoding.grid_positions(level.raw_colors.shape[0]), 0, PLACE_ROWS)
         yield compare_max("grid_places", f"means of {count} rays", actual[:, :3], means, 1e-5, 1.0)
         yield compare_max("grid_places", f"variances of {count} rays", actual[:, 3], variances, 1e-3)
     for tiles, bounds, keys in CASES:
-        case = FieldCase.sample(device, rng, 1, Draw(1, 2, 0), grid={**GRID, **keys}, degrees=2)
+        case = FieldCase.sample(device, rng, 1, RandomKey(1, 2, 0), grid={**GRID, **keys}, degrees=2)
         yield from _check_grid(device, rng, case, _random_positions(rng, tiles, bounds))
 
 
@@ -271,7 +271,7 @@ FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
 def fields(device: Device, rng: np.random.Generator) -> Results:
     """Compare the colors of rays, and the gradients of all parameters through the coarse and fine samples."""
     for count, keys in FIELDS_CASES:
-        case = FieldCase.sample(device, rng, count, Draw(3, 4, 2), **keys)
+        case = FieldCase.sample(device, rng, count, RandomKey(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
         errors, expected = device.zeros(2 + count), list[ref.Weights]()
         grad_entries = [np.zeros_like(grid.entries(case.parameters)) for grid in case.grid_levels()]
@@ -343,7 +343,8 @@ class _Comparison:
         for name, actual, expected in (("colors", colors, self.raw[0]), ("densities", densities, self.raw[1])):
             yield compare_max("dense_forward", f"raw {name}, {label}", actual, expected, 1e-4, 1.0)
         weights, transmittance = self.composite.weights()
-        for name, table, truth in (("weights", self.level.weights, weights), ("left", self.level.left, transmittance)):
+        level = self.level
+        for name, table, truth in (("weights", level.weights, weights), ("left", level.transmittance, transmittance)):
             yield compare_max("composite_forward", f"{name}, {label}", table.get(), truth, 1e-4, 1.0)
         yield compare_max("composite_forward", label, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 
@@ -358,7 +359,7 @@ class _Comparison:
 @CHECKS.add("place_colors")
 def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
     """Check that each pixel of an image is at the correct position, and that the padding is zero."""
-    case = FieldCase.sample(device, rng, 1, Draw(0, 1, 0))
+    case = FieldCase.sample(device, rng, 1, RandomKey(0, 1, 0))
     field = Field(case.shape, case.device_parameters, device.upload(BACKGROUND))
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)
     *_, level = case.levels.render(case.device_parameters, case.levels.cast(case.rays.camera, device.upload(pixels)))

@@ -56,7 +56,7 @@ class Live:
     def close(self) -> None:
         """Stop the server.  If a page is open, wait for a moment until it has received the end of the run."""
         state = self.state
-        state.pause(False)
+        state.set_paused(False)
         state.ended = True
         try:
             deadline = time.monotonic() + FAREWELL
@@ -162,7 +162,7 @@ class Live:
             while state.paused and not run.interrupted:
                 if state.idle_seconds() > PAUSE_TIMEOUT:
                     LOG.info("no live page connected for %.0f s; resuming training", PAUSE_TIMEOUT)
-                    state.pause(False)
+                    state.set_paused(False)
                 elif state.requests:
                     self._draw(run, preview, is_paused=True)
                 else:

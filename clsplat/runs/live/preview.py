@@ -25,7 +25,7 @@ from clsplat.scene.photographs import load_photograph
 from clsplat.scene.view import View
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
-from clsplat.viewer.page import LARGEST, THUMBNAIL
+from clsplat.viewer.page import PHOTO_SIDE, THUMBNAIL_SIDE
 
 # The queue of preview requests.
 
@@ -215,7 +215,7 @@ class Credit:
 # The photos of a run as JPEG.  They are read when a page requests them, and the browser caches them.
 
 Kind = Literal["thumbnail", "photograph"]
-JPEG_SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL, "photograph": LARGEST}
+JPEG_SIDES: dict[Kind, int] = {"thumbnail": THUMBNAIL_SIDE, "photograph": PHOTO_SIDE}
 JPEG_QUALITY = 88
 PHOTO_TIMEOUT = 20.0  # s that a request for a photo waits
 
@@ -328,7 +328,7 @@ class LiveState:
         """Return the time since the last request of a page, s."""
         return time.monotonic() - self.last_request
 
-    def pause(self, is_paused: bool) -> None:
+    def set_paused(self, is_paused: bool) -> None:
         """Pause or resume the training."""
         self.paused = is_paused
         self.requests.wake()

@@ -300,7 +300,7 @@ class Handlers:
 
     def _pause(self, is_paused: bool) -> Response:
         if not self.live.ended:
-            self.live.pause(is_paused)
+            self.live.set_paused(is_paused)
         return Response.json({"paused": self.live.paused})
 
     def _require_scene(self) -> ShownRun:

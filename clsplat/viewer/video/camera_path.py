@@ -68,8 +68,8 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         raise DataError(f"{path}: expected a JSON object with a list `camera_path`, as nerfstudio exports it")
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
-    if (kind := data.get("camera_type", "perspective")) != "perspective":
-        raise DataError(f"{path}: camera_type is {quote(kind)}; expected perspective; export the path again")
+    if (camera_type := data.get("camera_type", "perspective")) != "perspective":
+        raise DataError(f"{path}: camera_type is {quote(camera_type)}; expected perspective; export the path again")
     size, fps = _size_and_rate(JsonFrame(path.parent, str(path), data))
     to_scene = _world_transform(path, scene)
     views = []
@@ -182,8 +182,8 @@ def _world_transform(path: Path, scene: Path | None) -> Any:
 
 def _affine(file: Path) -> tuple[Floats, float]:
     """Read the rotation and translation, [3, 4], and the scale from a WORLD file.  Raises DataError."""
-    table = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
-    frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
+    data = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
+    frame = JsonFrame(file.parent, str(file), data if isinstance(data, dict) else {})
     matrix, scale = _rigid(frame, "transform"), frame.number("scale")
     if scale is None or not scale > 0:
         raise DataError(f"{file}: scale is {quote(scale)}; expected a number above 0; export the file again")
@@ -206,6 +206,6 @@ def _applied_transform(scene: Path | None) -> Floats:
     file = scene / TRANSFORMS if scene else None
     if file is None or not file.is_file():
         return np.eye(3, 4)
-    table = read_json(file, "cameras in JSON", limit=MAX_BYTES)
-    frame = JsonFrame(file.parent, str(file), table if isinstance(table, dict) else {})
+    data = read_json(file, "cameras in JSON", limit=MAX_BYTES)
+    frame = JsonFrame(file.parent, str(file), data if isinstance(data, dict) else {})
     return np.eye(3, 4) if frame.value("applied_transform") is None else _rigid(frame, "applied_transform")

@@ -42,7 +42,7 @@ class Canvas:
             return replace(layers, normals=depth_normals(layers.depth, view))
         return layers
 
-    def picture(self, view: View) -> Image:
+    def render_image(self, view: View) -> Image:
         """Render a view as 8-bit RGB, [height, width, 3]."""
         return to_8_bits(self.render_layers(view).image)
 
@@ -88,21 +88,21 @@ def layer_values(layers: Layers, layer: str) -> NDArray[np.float32]:
 def depth_normals(depth: NDArray[np.float32], view: View) -> NDArray[np.float32]:
     """Return the unit normals of a depth image, in the axes of the scene, toward the camera, [height, width, 3].
 
-    They are from the differences between the pixels above and below, left and right; 0 where one of them has no depth
-    or one that differs by more than MAX_STEP.
+    They are computed from the differences between the pixels above and below, and left and right.  They are 0 where a
+    neighbor has no depth, or a depth that differs by more than MAX_STEP.
     """
     camera, (height, width) = view.camera, depth.shape
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
     z = np.pad(depth.astype(np.float64), 1)
     points = np.stack([z[1:-1, 1:-1] * x, z[1:-1, 1:-1] * y[:, None], z[1:-1, 1:-1]], axis=2)
-    is_known = depth > 0
+    is_valid = depth > 0
     for neighbor in (z[1:-1, :-2], z[1:-1, 2:], z[:-2, 1:-1], z[2:, 1:-1]):
-        is_known = is_known & (np.abs(neighbor - depth) <= MAX_STEP * depth)
+        is_valid = is_valid & (np.abs(neighbor - depth) <= MAX_STEP * depth)
     padded = np.pad(points, ((1, 1), (1, 1), (0, 0)))
     normals = np.cross(padded[2:, 1:-1] - padded[:-2, 1:-1], padded[1:-1, 2:] - padded[1:-1, :-2])
     length = np.linalg.norm(normals, axis=2, keepdims=True)
-    unit = np.divide(normals, length, out=np.zeros_like(normals), where=is_known[:, :, None] & (length > 0))
+    unit = np.divide(normals, length, out=np.zeros_like(normals), where=is_valid[:, :, None] & (length > 0))
     return np.asarray(unit @ view.world_to_camera[:, :3], np.float32)
 
 

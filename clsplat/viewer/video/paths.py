@@ -41,7 +41,7 @@ class Rig:
     def from_views(cls, views: Sequence[View], points: Floats) -> "Rig":
         """Return a rig without outlier cameras and non-finite points.  Raises DataError if there is no view."""
         if not views:
-            raise DataError("a camera path needs the cameras of a scene, but there are none")
+            raise DataError("a camera path needs the cameras of a scene, but it has none; use another scene")
         is_outlier = outlier_cameras(views)
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         stride = -(-len(finite) // MAX_POINTS) or 1
@@ -331,7 +331,7 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
     turn = 2 * np.pi * TURNS * np.arange(frames) / frames
     steps = np.stack([np.cos(turn), np.sin(turn), np.sin(turn / 2)], axis=1) * radii
     positions = center + steps @ axes
-    return looking_views(
+    return look_at_targets(
         positions, np.broadcast_to(target, positions.shape), np.broadcast_to(rig.up, positions.shape), rig, size
     )
 
@@ -342,7 +342,7 @@ def fly_through(rig: Rig, frames: int, size: Size) -> list[View]:
     distance = float(np.median(rig.depths))
     keyframes = np.hstack([rig.positions, rig.positions + distance * rig.forwards, rig.ups])[order]
     track = smooth(keyframes, frames, distance)
-    return looking_views(track[:, :3], track[:, 3:6], track[:, 6:], rig, size)
+    return look_at_targets(track[:, :3], track[:, 3:6], track[:, 6:], rig, size)
 
 
 def views(rig: Rig, frames: int, size: Size) -> list[View]:
@@ -375,7 +375,7 @@ PATHS: dict[str, Callable[[Rig, int, Size], list[View]]] = {
 }
 
 
-def looking_views(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size) -> list[View]:
+def look_at_targets(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size) -> list[View]:
     """Return views at positions that look at targets, [F, 3] each.  Raises DataError if a view looks along up."""
     camera = same_area(rig.camera, size)
     try:
@@ -418,7 +418,7 @@ def _widest_gap(angles: Floats) -> tuple[float, float]:
 
 def _look_at(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[View]:
     targets, ups = (np.broadcast_to(vector, positions.shape) for vector in (target, rig.up))
-    return looking_views(positions, targets, ups, rig, size)
+    return look_at_targets(positions, targets, ups, rig, size)
 
 
 def nearest_view(view: View, views: Sequence[View], reach: float) -> View:

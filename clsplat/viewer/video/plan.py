@@ -102,7 +102,7 @@ class VideoRequest:
         """Parse the settings, and check everything that does not depend on the scene.  Raises ConfigError."""
         if path.partition(SEPARATOR)[0] not in PATHS and not path.lower().endswith(".json"):
             raise ConfigError(
-                f"path {quote(path)}: expected one of {', '.join(PATHS)}, or a file of nerfstudio (.json)"
+                f"path {quote(path)}: expected one of {', '.join(PATHS)}, or a .json file with a camera path"
             )
         if SEPARATOR in path and path.partition(SEPARATOR)[0] in PATHS and not path.startswith(f"fixed{SEPARATOR}"):
             raise ConfigError(f"path {quote(path)}: only `fixed{SEPARATOR}NAME` accepts the name of a view")
