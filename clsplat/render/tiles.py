@@ -18,7 +18,7 @@ from clsplat.render.workspace import GROWTH, Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
 Defines = dict[str, int] | None  # macros of the projection
-TRIALS = 3  # of each sort, before `auto` chooses
+TRIALS = 3  # number of timed runs of each sort, before `auto` chooses
 MAX_SINGLE_GROUP_RUN = 32  # values per item up to which one group scans everything
 MAX_SCAN_BLOCKS = 1024  # each block adds up the sums of all previous blocks
 
@@ -40,9 +40,9 @@ class TileLists:
     The lists are empty if there are more pairs than `room`; see `Tiler.has_room`.
     """
 
-    read_pairs: Callable[[], int]  # waits
+    read_pairs: Callable[[], int]  # returns the number of pairs; waits for the device
     room: int  # pairs that fit
-    limit: int  # of the room
+    limit: int  # largest `room`
     pair_splat: Array  # [room] Gaussian of each pair
     first_pair: Array  # [N] first pair of each Gaussian
     tile_count: Array  # [S] pairs of each Gaussian
@@ -100,17 +100,17 @@ class Tiler:
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
         self._room = 0  # pairs for which kernels are launched
-        self._all = device.upload(np.array([2**32 - 1], np.uint32))  # a number of keys above any room
+        self._max_key_count = device.upload(np.array([2**32 - 1], np.uint32))  # more keys than any room
 
     def build(
         self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines = None
     ) -> TileLists:
         """Build the tile lists of `count` splats in a band.  Waits only if there is no room for pairs yet.
 
-        The lists are valid if `has_room` is true.  limit: of the room.  Raises TooManyPairs like `has_room`.
+        The lists are valid if `has_room` is true.  limit: largest room.  Raises TooManyPairs like `has_room`.
         """
         if self.sort == "auto":
-            self.sort = self._faster_sort(splats, footprints, band, count, limit, defines)
+            self.sort = self._measure_faster_sort(splats, footprints, band, count, limit, defines)
         depth_key, tile_count = footprints.depth_key, footprints.tile_count
         large = self._large_arguments(splats, footprints, band, count)
         program = self.device.program("large.cl", **(defines or {}))
@@ -213,7 +213,7 @@ class Tiler:
         for number in range(passes):
             digits = 1 << min(width, bits - number * width)
             arguments: dict[str, Any] = {"groups": blocks, "shift": number * width, "digits": digits, "room": room}
-            arguments |= {"keys": keys, "key_count": key_count or self._all}
+            arguments |= {"keys": keys, "key_count": key_count or self._max_key_count}
             digit_count = self.workspace.array("digit_count", digits * blocks, np.uint32)
             self._radix.radix_count(digit_count=digit_count, **arguments)
             digit_offset = self.scan(digit_count, digits * blocks, "digit_offset")
@@ -281,7 +281,7 @@ class Tiler:
         bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
         return tile_offset, tile_pairs
 
-    def _faster_sort(
+    def _measure_faster_sort(
         self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines
     ) -> Sort:
         seconds: dict[Sort, float] = {}

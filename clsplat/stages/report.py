@@ -144,10 +144,7 @@ def _held_out_scores(run: Run) -> tuple[str, Scores | None]:
 
 
 def _training_psnr(run: Run, lines: list[dict[str, Any]], step: int) -> float | None:
-    """Return the PSNR of training views in dB.
-
-    It is as measured at a step, or else the moving average of the values logged up to it.
-    """
+    """Return the PSNR of training views in dB: as measured at a step, or else averaged from the log before it."""
     values = [line["psnr"] for line in lines if line["split"] == "train" and line["step"] == step]
     reports = [line["psnr"] for line in run.records.read("train") if line["step"] <= step]
     return values[-1] if values else moving_average(reports)[-1] if reports else None

@@ -291,7 +291,7 @@ def test_sky_gaussians_match_its_colors_in_all_directions(rng, sky_run):
 
 
 def test_sky_of_transparent_photographs_is_warned_of(tiny_scene, yard, tmp_path, caplog):
-    transparent = "the photos are transparent, so the sky would learn the color that clsplat puts behind them"
+    transparent = "the photos have transparent pixels, so the sky would learn the color that clsplat puts behind them"
     few = ("optimize.steps=2", "init.count=60", "optimize.during=[]", "model.background={type: envmap, side: 8}")
     for scene, is_warned in ((tiny_scene, True), (yard[1], False)):
         caplog.clear()

@@ -109,8 +109,8 @@ class ModuleState:
     def start(self, run: Run) -> None:
         """Set the initial values in a run without an earlier state of this module."""
 
-    def prepare(self, run: Run, last: int, trained: bool = True) -> None:
-        """Prepare for training that ends at global step `last`.  trained: whether the module learns in this run."""
+    def prepare(self, run: Run, last_step: int, is_trained: bool = True) -> None:
+        """Prepare for training that ends at global step `last_step`.  is_trained: whether the module learns in it."""
 
     # in a step: forward in list order, backward and update in reverse
     def before_render(self, step: TrainingStep) -> None: ...
@@ -223,25 +223,25 @@ def check_list(modules: Sequence[TrainingModule]) -> None:
         types[module.group] = module.type
 
 
-def attach_modules(modules: Sequence[TrainingModule], run: Run, last: int) -> list[ModuleState]:
-    """Create the module states for training that ends at global step `last`, and return them in order.
+def attach_modules(modules: Sequence[TrainingModule], run: Run, last_step: int) -> list[ModuleState]:
+    """Create the module states for training that ends at global step `last_step`, and return them in order.
 
     There is a state for each listed module, for each module that the model or the losses imply, and for each module of
     an earlier training run that is still active.
     """
-    trainable = [module for module in (*implied_modules(run), *modules) if module.is_active(run.scene)]
-    groups = {module.group for module in trainable}
+    new_modules = [module for module in (*implied_modules(run), *modules) if module.is_active(run.scene)]
+    groups = {module.group for module in new_modules}
     earlier_modules = [m for m in modules_so_far(run).values() if m.type in run.modules and m.group not in groups]
-    active = [module for module in earlier_modules if run.modules[module.type].after_training == "active"]
+    active_modules = [module for module in earlier_modules if run.modules[module.type].after_training == "active"]
     states, old_states = list[ModuleState](), run.modules
     run.modules = {module.type: old_states[module.type] for module in earlier_modules}
-    for module in sorted([*trainable, *active], key=lambda module: module.order):
+    for module in sorted([*new_modules, *active_modules], key=lambda module: module.order):
         state, old_state = module.create_state(run), old_states.get(module.type)
         if old_state and old_state is not state and state.can_load(old_state.scalars, tables := old_state.tables()):
             state.load(old_state.scalars, tables)
         elif old_state is not state:
             state.start(run)
-        state.prepare(run, last, module in trainable)
+        state.prepare(run, last_step, module in new_modules)
         if state.is_saved:
             run.modules[module.type] = state
         states.append(state)

@@ -81,7 +81,7 @@ class BilateralGrid(Appearance):
             raise DataError(f"its grids do not have the shape [photographs, {ENTRIES}, nz, ny, nx]")
         rows, count = sorted(row for key, row in scalars.items() if key.endswith("/row")), len(tables["values"])
         if rows != list(range(count)):
-            raise DataError(f"it has color grids for {count} photos, but scalars for another number")
+            raise DataError(f"it has color grids for {count} photos, but scalars for another number of photos")
 
     def rate_schedule(self, steps: int, photographs: int, is_warm_start: bool = True) -> Schedule:
         if self.rate != "auto":
@@ -94,7 +94,7 @@ class BilateralGrid(Appearance):
         return Points(points=[[0.0, at_step(rate, 0) / 100], *points.values()])
 
     @property
-    def fit(self) -> Gain:
+    def color_model(self) -> Gain:
         return Gain()
 
 
@@ -267,7 +267,7 @@ class GridState(ColorState):
 
 
 def row_length(shape: Sequence[int]) -> int:
-    """Return the number of values in the grid of one photograph.  shape: numbers of nodes, nx, ny, nz in any order."""
+    """Return the number of values in the grid of one photograph.  shape: nx, ny, nz, in any order."""
     return ENTRIES * math.prod(shape)
 
 

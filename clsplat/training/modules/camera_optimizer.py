@@ -34,9 +34,9 @@ AXES = "x", "y", "z"
 RATE, MAX_RATE = 2e-4, 2e-3  # initial learning rates
 RATE_RATIO = 100  # ratio of the initial rate to the final rate
 ROTATION_RATIO = 0.3  # ours; a rotation about the pivot changes the image little, so its gradient is mostly noise
-REACH = 0.01  # translation, relative to the depth, to which the rates of all visits must add up
+REACH = 0.01  # smallest sum of the rates of a photo's visits, relative to the depth
 FOCAL_RATE, MAX_FOCAL_RATE = 1e-4, 1e-3  # likewise, for the logarithms of focal lengths
-FOCAL_REACH = 0.2  # likewise; most of it is noise, and changes are a few hundredths
+FOCAL_REACH = 0.2  # likewise, of a camera's visits; most updates are noise, and changes are a few hundredths
 MIN_POINTS = 10  # number of points that are required for a median depth
 MAX_ZOOM = 10.0  # largest factor on a focal length in a side file
 LOG = logging.getLogger("clsplat")
@@ -72,8 +72,8 @@ class CameraOptimizer(TrainingModule):
     rotation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
     """Learning rate of rotations, rad; may be scheduled.  auto: 0.3 times the automatic rate of translations."""
     translation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
-    """Learning rate of translations, relative to that depth; may be scheduled.  auto: 2e-4 to 2e-6; with few visits per
-    photo, large enough for a translation of 0.01, up to 2e-3."""
+    """Learning rate of translations, relative to the median depth; may be scheduled.  auto: 2e-4 to 2e-6; with few
+    visits per photo, large enough for a translation of 0.01, up to 2e-3."""
     focal: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = 0.0
     """Learning rate of the logarithms of focal lengths; may be scheduled; 0: fixed.  auto: 1e-4 to 1e-6; with few
     visits per camera, large enough that the rates of its visits add up to 0.2, up to 1e-3."""
@@ -193,12 +193,12 @@ class CameraState(ModuleState):
             table.begin(self.scalars, {})
         self.scalars |= {f"{DEPTHS}/{view.name}": median_depth(view, run.scene) for view in self.views}
 
-    def prepare(self, run: Run, last: int, trained: bool = True) -> None:
-        if not trained:
+    def prepare(self, run: Run, last_step: int, is_trained: bool = True) -> None:
+        if not is_trained:
             return
         names = {view.name for view in self.views}
-        zoom_rate = self.settings.focal_rate(last, len({self.cameras[name] for name in names}))
-        self.rates = *self.settings.rates(last, len(names)), zoom_rate
+        zoom_rate = self.settings.focal_rate(last_step, len({self.cameras[name] for name in names}))
+        self.rates = *self.settings.rates(last_step, len(names)), zoom_rate
         if zoom_rate:
             require_zoom(run.original)
 
@@ -283,7 +283,7 @@ class CameraState(ModuleState):
         cameras = self.zoomed_cameras
         data = {
             "meaning": "optimized poses, rows of [R | t], world to camera; learned: true for training photos; "
-            "others move with them as a whole"
+            "others follow their common motion"
             + ("; focal_lengths: in x and y, px, at the full size of the undistorted photos" if cameras else ""),
             "photographs": {
                 view.name: {

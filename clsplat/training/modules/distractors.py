@@ -119,10 +119,10 @@ class DistractorsState(ModuleState):
     def backward(self, step: TrainingStep) -> None:
         if not (saved := step.saved_value(self)):
             return
-        layer, sums = saved
+        layer, results = saved
         frame = replace(layer.frame, image=layer.image)  # the gradient of blending needs the combined colors
         arguments = frame.model, frame, step.gradient
-        sums += [frame, self.rasterizer.pixel_sums(*arguments, transmittance_gradient=layer.transmittance_gradient)]
+        results += [frame, self.rasterizer.pixel_sums(*arguments, transmittance_gradient=layer.transmittance_gradient)]
         backpropagate_composite(step.workspace, frame, step.gradient)
 
     def update(self, step: TrainingStep) -> None:

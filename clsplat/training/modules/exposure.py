@@ -38,16 +38,16 @@ from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
 VIEW_COLORS = "view_colors.json"
-TABLE, KNOWN = "colors", "known exposures"  # names of scalars; KNOWN: whether the initial exposures were known
+TABLE, HAS_KNOWN = "colors", "known exposures"  # names of scalars; HAS_KNOWN: whether the initial exposures were known
 SUMS = int(constants("colors.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
 MIN_VISITS = 400  # visits per photograph; with fewer, Adam with a rate of 2e-3 cannot reach a gain of 1.5
 MAX_RATE = 5e-2
 Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # the size of an Adam step: a gain of 1.6
 RateOrAuto = Annotated[Literal["auto"] | Rate, explain_schedule(", or auto")]
-SPREAD = 0.03  # accuracy of measurements on tracks
+MIN_SPREAD = 0.03  # accuracy of measurements on tracks
 # In three captures, exposure explains 17 to 31% of the variance; with exposures changed by 25%, 40 to 71%.
-EXPLAINED = 1 / 3
+MIN_EXPLAINED = 1 / 3
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,9 @@ class Appearance(TrainingModule):
     Before training, log exposures are measured on the tracks of the dataset's points.  The module is active if both
     their standard deviation and the fraction of variance that they explain are large enough; view-dependent light
     explains the remainder.  If it is not active, the model is bit-identical to one without the module."""
-    min_spread: Annotated[float, Field(ge=0)] = SPREAD
+    min_spread: Annotated[float, Field(ge=0)] = MIN_SPREAD
     """With `when: auto`, the smallest standard deviation of log exposures; 0.03 is 3%."""
-    min_explained_variance: Annotated[float, Field(ge=0, lt=1)] = EXPLAINED
+    min_explained_variance: Annotated[float, Field(ge=0, lt=1)] = MIN_EXPLAINED
     """With `when: auto`, the smallest fraction of the color variance of points that exposures explain."""
     chosen: Literal["on", "off"] | None = None
     """Written by a run: the choice of `auto`."""
@@ -95,7 +95,7 @@ class Appearance(TrainingModule):
 
     @property
     @abstractmethod
-    def fit(self) -> "ColorModel":
+    def color_model(self) -> "ColorModel":
         """The color model that metrics fit to each photograph."""
 
     def is_active(self, scene: Scene | None = None) -> bool:
@@ -147,7 +147,7 @@ class Appearance(TrainingModule):
                 f"{path}: unknown color type {quote(name)}; expected {names}; train again, or remove the file"
             )
         fields = {key: data[key] for key in ("model",) if key in data}
-        return classes[name].model_validate(fields).fit if classes[name] is cls else None
+        return classes[name].model_validate(fields).color_model if classes[name] is cls else None
 
 
 class ColorModel(Settings):
@@ -251,7 +251,7 @@ class Exposure(Appearance):
     """`gain`: exposure and white balance; `affine`: a full matrix."""
 
     @property
-    def fit(self) -> ColorModel:
+    def color_model(self) -> ColorModel:
         return self.model
 
     def create_state(self, run: Run) -> "ExposureState":
@@ -272,18 +272,18 @@ class ColorState(ModuleState):
     def start(self, run: Run) -> None:
         exposures = estimate_exposures(run)
         self.start_from(exposures.log_gains)
-        self.scalars[KNOWN] = float(bool(exposures.log_gains))
+        self.scalars[HAS_KNOWN] = float(bool(exposures.log_gains))
         LOG.info("colors of photos: %s", exposures.text)
 
-    def prepare(self, run: Run, last: int, trained: bool = True) -> None:
-        self.rate = self.settings.rate_schedule(last, len(self.names), self.scalars.get(KNOWN, 1.0) > 0)
+    def prepare(self, run: Run, last_step: int, is_trained: bool = True) -> None:
+        self.rate = self.settings.rate_schedule(last_step, len(self.names), self.scalars.get(HAS_KNOWN, 1.0) > 0)
 
     def start_from(self, log_gains: Mapping[str, Floats]) -> None:
         """Initialize the parameters.  log_gains: of red, green, and blue, [3], by view, for views with known gains."""
 
     @property
     def color_model(self) -> ColorModel:
-        return self.settings.fit
+        return self.settings.color_model
 
     @abstractmethod
     def report(self) -> ColorReport:

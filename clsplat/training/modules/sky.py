@@ -35,8 +35,8 @@ class SkyModule(TrainingModule):
         """Return the sky that the init stage created, or a black sky into which a saved state is loaded."""
         settings = run.model_settings.sky
         assert settings
-        blank = Sky(np.zeros((settings.side**2, 3), np.float32))
-        return run.modules.get(SKY) or LearnedSky(settings, blank.upload(run.device))
+        black_sky = Sky(np.zeros((settings.side**2, 3), np.float32))
+        return run.modules.get(SKY) or LearnedSky(settings, black_sky.upload(run.device))
 
     @classmethod
     def check_saved(cls, scalars: Scalars, tables: Tables) -> None:

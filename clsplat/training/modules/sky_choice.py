@@ -53,8 +53,8 @@ def start_sky(run: Run, source: Model | None) -> None:
         return
     if is_transparent(run.scene):
         LOG.warning(
-            "model.background: the photos are transparent, so the sky would learn the color that clsplat puts "
-            "behind them; remove model.background"
+            "model.background: the photos have transparent pixels, so the sky would learn the color that clsplat "
+            "puts behind them; remove model.background"
         )
     texels, free = _first_texels(run, background.side)
     sky = initial if initial and initial.side == background.side else Sky(texels)

@@ -17,8 +17,8 @@ from clsplat.render.workspace import Workspace
 from clsplat.training.modules.base import ModuleState, Scalars, TrainingModule, TrainingStep
 from clsplat.training.run import Run
 
-_NAMES = constants("transients.cl")
-BINS, FIRST_BIN, BIN_SHIFT = (int(_NAMES[name]) for name in ("BINS", "FIRST_BIN", "BIN_SHIFT"))
+_CONSTANTS = constants("transients.cl")
+BINS, FIRST_BIN, BIN_SHIFT = (int(_CONSTANTS[name]) for name in ("BINS", "FIRST_BIN", "BIN_SHIFT"))
 KEYS = tuple(f"{k:02d}" for k in range(BINS))
 TAIL = 0.99  # quantile by which outliers are detected
 
