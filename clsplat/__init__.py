@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from clsplat import metrics as metrics
+    from clsplat.api.commands import align as align
     from clsplat.api.commands import cancel as cancel
     from clsplat.api.commands import check as check
     from clsplat.api.commands import compare_runs as compare_runs
@@ -89,7 +90,7 @@ class _CheckoutFinder:
 
 sys.meta_path.append(_CheckoutFinder)
 _EXPORTS = {  # modules that define the names; `import clsplat` does not import them
-    "clsplat.api.commands": "cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
+    "clsplat.api.commands": "align cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
     " pipeline_schema pipelines plan_in_blocks resume run run_cell status status_schema"
     " run_worker train_in_blocks view write_levels",
     "clsplat.api.rendering": "camera_path render_path render_views write_cameras write_video",

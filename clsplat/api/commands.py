@@ -463,6 +463,39 @@ def convert(
     return conversion.convert(files, Path(out), changes, quality)
 
 
+def align(
+    path: PathLike,
+    out: PathLike,
+    scene: PathLike | None = None,
+    *,
+    level: Literal["cameras", "ground"] | None = None,
+    distances: Sequence[str] = (),
+    gps: bool = False,
+    control: PathLike | None = None,
+    format: Literal["colmap", "nerfstudio", "inria"] = "colmap",
+    images: Literal["none", "copy"] = "copy",
+) -> dict[str, Any]:
+    """Give a scene or a model a known scale, up direction, or position, as `clsplat align` does.
+
+    path: a dataset folder, a model file, or a run folder
+    out: a model file, or a folder for the cameras of the scene in this `format`, with a copy of the photos or without
+    scene: the dataset of a model file
+    level: where the up direction comes from, which becomes -y
+    distances: such as "A;B=1.25", where A and B are "x,y,z", "PHOTO:u,v+PHOTO:u,v", or names in the control file
+    gps: use the GPS positions in the EXIF data of the photos; coordinates become UTM, and z points up
+    control: a CSV file of points in photos, with the columns point, x, y, z, photo, u, and v
+
+    Returns `scale`, `matrix` (4 x 4), `epsg`, `rms`, the names of `outliers`, the errors of `points` and `distances`,
+    and `files`.  Raises DataError if the points do not determine the transform.
+    """
+    from clsplat.workflows.align import AlignOptions
+    from clsplat.workflows.align import align as align_files
+
+    load_plugins()
+    options = AlignOptions(level, tuple(distances), gps, to_path(control))
+    return align_files(Path(path), Path(out), to_path(scene), options, format, images)
+
+
 # Pages about runs and models.
 
 

@@ -29,6 +29,7 @@ SYNONYMS = {
     **dict.fromkeys(("benchmark", "time", "profile"), "bench"),
     **dict.fromkeys(("prove", "diagnose", "selftest"), "doctor"),
     **dict.fromkeys(("export", "transform", "merge"), "convert"),
+    **dict.fromkeys(("level", "georeference", "register"), "align"),
     **dict.fromkeys(("shrink", "prune", "quantize"), "compress"),
     **dict.fromkeys(("decimate", "simplify", "levels", "stream"), "lod"),
     **dict.fromkeys(("split", "tiles", "city"), "blocks"),
@@ -42,7 +43,7 @@ MIN_ADDRESS_SPACE = 1 << 30  # bytes; OpenCL runtimes need more
 ORDER = [
     *("run", "blocks", "resume", "status", "cell", "cancel", "worker"),
     *("check", "pipelines", "devices", "doctor", "inspect"),
-    *("render", "view", "evaluate", "convert", "compress", "lod", "compare", "bench", "data"),
+    *("render", "view", "evaluate", "align", "convert", "compress", "lod", "compare", "bench", "data"),
 ]
 
 

@@ -174,6 +174,71 @@ def convert(
 
 
 @command(
+    "align",
+    "clsplat align my_scene leveled --level cameras",
+    "clsplat align runs/splat_7k metric.ply --distance 'a.jpg:812,403+b.jpg:790,410;1.2,0,3.4=1.25'",
+    "clsplat align my_scene on_map --gps",
+    "clsplat align my_scene surveyed --control points.csv",
+)
+def align(
+    path: Annotated[
+        Path, typer.Argument(metavar="SCENE|MODEL|RUN", help="A dataset folder, a model file, or a run folder.")
+    ],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="A model file to write, or a folder for cameras and photos.")
+    ],
+    scene: SceneOption = None,
+    level: Annotated[
+        Literal["cameras", "ground"] | None, typer.Option(help="Turn the scene upright; where up comes from.")
+    ] = None,
+    distance: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="A;B=LENGTH",
+            help="A known distance; A and B: x,y,z, or PHOTO:u,v+PHOTO:u,v, or names in --control; may be repeated.",
+        ),
+    ] = None,
+    gps: Annotated[bool, typer.Option("--gps", help="Use GPS positions in EXIF; coordinates become UTM.")] = False,
+    control: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.csv", help="Points marked in photos, with columns point, x, y, z, photo, u, v."),
+    ] = None,
+    format_: Annotated[
+        Literal["colmap", "nerfstudio", "inria"], typer.Option("--format", help="Format of the cameras in a folder.")
+    ] = "colmap",
+    images: Annotated[Literal["none", "copy"], typer.Option(help="Whether to copy the photos to a folder.")] = "copy",
+    as_json: JsonOption = False,
+) -> None:
+    """Give a scene or a model its true scale, up direction, or map coordinates, and print the errors that remain."""
+    from clsplat.workflows.align import table
+
+    if as_json:
+        terminal.keep_stdout_for_json()
+    result = commands.align(
+        path,
+        out,
+        scene,
+        level=level,
+        distances=distance or [],
+        gps=gps,
+        control=control,
+        format=format_,
+        images=images,
+    )
+    if as_json:
+        terminal.show_json(result)
+        return
+    if result["points"] or result["distances"]:
+        terminal.show(table(result))
+    rms = (
+        ""
+        if result["rms"] is None
+        else f", RMS error {result['rms']:.4g}, {pluralize(len(result['outliers']), 'outlier')}"
+    )
+    terminal.print_message(f"{out}: scaled by {result['scale']:.6g}{rms}")
+
+
+@command(
     "compress",
     "clsplat compress runs/splat_7k --target -0.1dB",
     "clsplat compress point_cloud.ply --scene my_scene --target 5MB",

@@ -234,7 +234,8 @@ class Model:
     ) -> "Model":
         """Return the model after x -> scale · rotation x + translation; view-dependent colors rotate with it.
 
-        rotation: [3, 3]; translation: [3] scene units, added to the origin if the model has one, else to the means.
+        rotation: [3, 3]; translation: [3] scene units, added to the origin if the model has one, else to the means; if
+        float32 is too coarse for these, the result has an origin.
         Raises ValueError for a matrix that is not a rotation, and if the result does not fit in a model file.
         """
         matrix = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
@@ -245,6 +246,10 @@ class Model:
             if origin.any():
                 origin, shift = scale * matrix @ origin + shift, np.zeros(3)
             results: dict[str, Any] = transform(self.tables(), scale, matrix, shift)
+            means = results["means"]
+            if not origin.any() and np.isfinite(means).all() and not is_float32_precise(means, results["log_scales"]):
+                origin = far_origin(np.median(means, axis=0), means)
+                results["means"] = means - origin
             if self.motion is not None:
                 results["motion"] = transform_motion(self.motion, scale, matrix)
             if self.filter_variance is not None:

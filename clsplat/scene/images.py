@@ -271,10 +271,10 @@ def _decode(data: bytes, path: Path, flags: int) -> NDArray[Any]:
 
 EXPOSURES_FILE = "exposures.json"  # in a folder of images
 EXIF_IFD = 0x8769  # tag with the offset of the exposure tags
-GPS_IFD, LATITUDE, LONGITUDE = 0x8825, 2, 4
+GPS_IFD, SOUTH, LATITUDE, WEST, LONGITUDE, BELOW, ALTITUDE = 0x8825, 1, 2, 3, 4, 5, 6  # SOUTH, WEST, BELOW: signs
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
 MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm equivalent for 35 mm film
-TEXT, SHORT, LONG, RATIONAL = 2, 3, 4, 5  # types of values
+BYTE, TEXT, SHORT, LONG, RATIONAL = 1, 2, 3, 4, 5  # types of values
 PLAUSIBLE = ((1e-7, 1e5), (0.1, 1e3), (0.1, 1e8))  # seconds, f-number, ISO
 Value = float | str
 
@@ -321,6 +321,20 @@ def read_exif_camera(path: Path) -> tuple[str, bool]:
     return " ".join(filter(None, parts)), LATITUDE in tags and LONGITUDE in tags
 
 
+def read_exif_position(path: Path) -> tuple[float, float, float] | None:
+    """Return the GPS latitude and longitude (degrees) and altitude (m) in the EXIF data of a JPEG file.
+
+    Returns None unless it has all three, in their range.  Raises DataError when the file cannot be read.
+    """
+    tags = _read_tags(path)
+    values = [tags.get(tag) for tag in (LATITUDE, LONGITUDE, ALTITUDE)]
+    latitude, longitude, altitude = (float(value) if isinstance(value, float) else math.nan for value in values)
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) < 1e5):
+        return None
+    signs = [-1 if tags.get(tag) == mark else 1 for tag, mark in ((SOUTH, "S"), (WEST, "W"), (BELOW, 1))]
+    return signs[0] * latitude, signs[1] * longitude, signs[2] * altitude
+
+
 def copy_exif(head: bytes, jpeg: bytes) -> bytes:
     """Return the upright JPEG file `jpeg` with the EXIF data of another file, except for the rotation.
 
@@ -357,17 +371,23 @@ def _read_tags(path: Path) -> dict[int, Value]:
 
 
 def _read_ifd(block: bytes, order: str, start: int) -> dict[int, Value]:
-    """Return the values of an image file directory (IFD) by tag.  The value of an array is its first element."""
+    """Return the values of an image file directory (IFD) by tag.
+
+    The value of an array is its first element; three rationals are degrees, minutes, and seconds, in degrees.
+    """
     values: dict[int, Value] = {}
     (entries,) = struct.unpack_from(order + "H", block, start)
     for entry in range(start + 2, start + 2 + 12 * entries, 12):
         tag, value_type, count, value = struct.unpack_from(order + "HHII", block, entry)
         if value_type == RATIONAL:
-            numerator, denominator = struct.unpack_from(order + "II", block, value)
-            if denominator:
-                values[tag] = numerator / denominator
-        elif value_type in (SHORT, LONG):
-            (values[tag],) = struct.unpack_from(order + ("H" if value_type == SHORT else "I"), block, entry + 8)
+            numbers = struct.unpack_from(order + "II" * (3 if count == 3 else 1), block, value)
+            if numbers[1]:  # of the others, 0/0 means unknown
+                pairs = zip(numbers[::2], numbers[1::2], strict=True)
+                values[tag] = sum(n / (d or 1) / 60**i for i, (n, d) in enumerate(pairs))
+        elif value_type in (BYTE, SHORT, LONG):
+            (values[tag],) = struct.unpack_from(
+                order + {BYTE: "B", SHORT: "H", LONG: "I"}[value_type], block, entry + 8
+            )
         elif value_type == TEXT:
             offset = value if count > 4 else entry + 8
             values[tag] = block[offset : offset + count].split(b"\0")[0].decode("ascii", "replace").strip()

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.errors import DataError
+from clsplat.formats.splats import typical_size
 from clsplat.scene.camera import Camera
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View
@@ -72,6 +74,49 @@ def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     axis = up if length > np.linalg.norm(forward) / 2 else -forward
     axis = axis if np.linalg.norm(axis) > np.finfo(np.float32).eps else -poses[0, 1, :3]
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
+
+
+MAX_TILT = np.radians(45)  # of a ground plane, from the expected up direction
+PLANES, PLANE_POINTS = 2000, 5000  # candidates, each through three points, and points to compare them with
+THICKNESS = 0.015  # of the ground, relative to the typical size of the points
+MIN_GROUND = 0.1  # fraction of the points
+REFINEMENTS = 10
+
+
+def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
+    """Return the normal of the ground, [3], unit, and the height of the ground along it.
+
+    It is the plane with the most points in it, minus the points below it, among planes that are tilted by at most 45
+    degrees from `up`, [3], unit.  points: [N, 3].  Raises DataError if few points are on a plane.
+    """
+    rng = np.random.default_rng(0)
+    points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+    points = points[rng.permutation(len(points))[:PLANE_POINTS]]
+    if len(points) < 3:
+        raise DataError("there are too few points to find the ground; add --scene, or use another option")
+    center, thickness = np.median(points, axis=0), THICKNESS * typical_size(points)
+    points = points - center
+    a, b, c = points[rng.integers(len(points), size=(3, PLANES))]
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    cosines = normals @ up
+    is_level = np.abs(cosines) >= np.cos(MAX_TILT)
+    normals, a = (normals * np.sign(cosines)[:, None])[is_level], a[is_level]
+    if not len(normals):
+        raise DataError("no plane of the points is level; rotate the scene first, or use another option")
+    heights = normals @ points.T - (normals * a).sum(axis=1, keepdims=True)
+    scores = (np.abs(heights) < thickness).sum(axis=1) - (heights < -3 * thickness).sum(axis=1)
+    normal, height = normals[scores.argmax()], float(normals[scores.argmax()] @ a[scores.argmax()])
+    for _ in range(REFINEMENTS):
+        ground = points[np.abs(points @ normal - height) < 2 * thickness]
+        if len(ground) < max(3, MIN_GROUND * len(points)) or normal @ up < np.cos(MAX_TILT):
+            raise DataError(
+                f"only {len(ground) / len(points):.1%} of the points are on a level plane; use another option"
+            )
+        axis = np.linalg.svd(ground - ground.mean(axis=0), full_matrices=False)[2][2]
+        normal = axis if axis @ normal > 0 else -axis
+        height = float(normal @ ground.mean(axis=0))
+    return normal, height + float(normal @ center)
 
 
 def perpendicular(up: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.scene import camera_files
+from clsplat.scene.control import read_control
 from clsplat.scene.scene import make_scene
 from clsplat.viewer.video import camera_path
 from clsplat.viewer.video.paths import MAX_FRAMES, SIDES
@@ -38,6 +39,18 @@ def test_damaged_path_is_read_or_refused(seeds, folder):
             assert 1 <= len(actual.views) <= MAX_FRAMES
             assert all(view.camera.check() and max(actual.size) <= SIDES[1] for view in actual.views)
             assert all(view.name == f"frame_{i:05d}" for i, view in enumerate(actual.views, 1))
+
+    reads()
+
+
+def test_damaged_control_points_are_read_or_refused(folder):
+    text = "point,x,y,z,photo,u,v\na,1,2,3,p.png,4,5\na,,,,q.png,6,7\nb,1e3,-2,3,p.png,4,5\n"
+
+    @fuzzed(80, data=damaged([text.encode()], [",", '"', "nan", "1e99", "\n", "photo"]))
+    def reads(data):
+        (folder / "points.csv").write_bytes(data)
+        for point in (outcome(read_control, folder / "points.csv") or {}).values():
+            assert np.isfinite([*(point.known or ()), *(value for mark in point.marks for value in mark.pixel)]).all()
 
     reads()
 

@@ -51,7 +51,7 @@ HOW_TO = (
         "lod",
         "blocks",
     ),
-    *("formats", "viewer", "video", "live", "pipelines", "training", "moving", "nerf", "python"),
+    *("formats", "align", "viewer", "video", "live", "pipelines", "training", "moving", "nerf", "python"),
     *("datasets", "devices", "sweeps", "deploy", "extending", "plugin_examples", "reliability", "first_scene"),
 )
 NAMED = [(base, kind) for base, kinds in families().items() for kind in kinds]

@@ -21,6 +21,7 @@ TEXTS = {  # what turns results into lines of text, which the commands print
     "clsplat.runs.status": {"status_text", "summary"},
     "clsplat.runs.verify": {"lines", "verdict"},
     "clsplat.sweeps.status": {"overview_text"},
+    "clsplat.workflows.align": {"table"},
     "clsplat.workflows.blocks": {"status_table", "table"},
     "clsplat.workflows.compress": {"table"},
     "clsplat.workflows.lod": {"table"},
