@@ -130,7 +130,7 @@ def counted(items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
 
 @contextmanager
 def polled(counter: ItemCounter, poll: Callable[[], int]) -> Iterator[None]:
-    """Report the progress of the block from a thread that gets the number of finished items from `poll`."""
+    """Report the progress of the block from a thread that calls `poll` for the number of finished items."""
     stop, context = threading.Event(), contextvars.copy_context()
 
     def watch() -> None:

@@ -1,4 +1,4 @@
-"""Read regular files of limited size; pipes and devices are refused, because they may never end."""
+"""Read regular files of limited size; pipes and devices are rejected, because reading them may never end."""
 
 import errno
 import hashlib

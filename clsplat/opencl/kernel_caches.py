@@ -99,7 +99,7 @@ def _is_truncated(library: Path) -> bool:
 
 
 def _is_database(file: Path) -> bool:
-    """Return whether a file is empty or a complete SQLite database, with as many pages as its header states."""
+    """Return whether a file is empty, or an SQLite database with all pages that its header states."""
     with suppress(OSError), open_regular(file) as stream:
         head = stream.read(SQLITE_HEADER)
         if len(head) < SQLITE_HEADER or not head.startswith(SQLITE):

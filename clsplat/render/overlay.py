@@ -44,7 +44,7 @@ def composite_layer(workspace: Workspace, frame: Frame, image: Array, scale: flo
 
 
 def backpropagate_composite(workspace: Workspace, frame: Frame, gradient: Array) -> None:
-    """Convert the gradient of the composite, [3 or 4, rows, stride], to that of the image behind, in place."""
+    """Convert the gradient of the composite, [3 or 4, rows, stride], to that of the image under the layer, in place."""
     camera = frame.camera
     workspace.device.program("layer.cl").look_behind(
         groups=(1, camera.rows),

@@ -43,7 +43,7 @@ class Plain(Appearance):
         return Views(self, [view.name for view in run.scene.split("train")])
 
     @property
-    def fit(self):
+    def color_model(self):
         return Gain()
 
 
