@@ -41,7 +41,7 @@ from clsplat.gaussians.motion import evaluate_at, transform_motion
 from clsplat.gaussians.sky import WITHOUT_SKY, Sky, read_sky_file, without_sky_path, write_sky_file
 from clsplat.opencl.device import Device
 from clsplat.scene.quality import near_plane
-from clsplat.scene.scene import Scene, far_origin, position_text
+from clsplat.scene.scene import Scene, far_origin, format_position
 
 # The rendering parameters of a model, as stored in its file.
 
@@ -277,7 +277,7 @@ class Model:
         if not self.origin.any() and np.any(origin) and len(self):
             center = np.median(self.means, axis=0).astype(np.float64)
             if np.linalg.norm(center) < np.linalg.norm(center - origin):
-                LOG.info("the model has no origin; its means are assumed relative to %s", position_text(origin))
+                LOG.info("the model has no origin; its means are assumed relative to %s", format_position(origin))
                 return replace(self, origin=origin)
         shift = self.origin - origin
         return replace(self, means=self.means + shift, origin=origin) if shift.any() else self
@@ -326,7 +326,7 @@ class Model:
             LOG.info("%s: x, y, and z are doubles, since floats are too coarse for world coordinates", path)
         else:
             raise ConfigError(
-                f"{path}: world coordinates around {position_text(self.origin)} exceed the precision of this format; "
+                f"{path}: world coordinates around {format_position(self.origin)} exceed the precision of this format; "
                 "write a .ply, or omit --world: GLB and OpenUSD store the origin in their node"
             )
         local = replace(self, origin=np.zeros(3)).to_splat_file()
@@ -352,7 +352,7 @@ class Model:
             "box, scene units": f"({', '.join(f'{v:.3g}' for v in low)}) to ({', '.join(f'{v:.3g}' for v in high)})",
             "median scale": f"{float(np.median(self.scales)):.3g} scene units" if len(self) else "–",
             "median opacity": f"{float(np.median(self.opacities)):.3g}" if len(self) else "–",
-            **({"origin, world coordinates": position_text(self.origin)} if self.origin.any() else {}),
+            **({"origin, world coordinates": format_position(self.origin)} if self.origin.any() else {}),
             "size as PLY": f"{sum(table.nbytes for table in self.tables().values()) / 2**20:,.1f} MiB",
         }
         return render_summary(rows)

@@ -12,7 +12,7 @@ from clsplat.formats.splats import Reading, motion_fields, not_finite, too_large
 from clsplat.formats.streamed_sog import LOD_META, find_level_faults
 from clsplat.formats.table import detect, format_of_name, model_file
 from clsplat.gaussians.model import Model, load
-from clsplat.scene.scene import position_text
+from clsplat.scene.scene import format_position
 
 UNSUPPORTED = (".usd", ".usdc", ".usdz", ".obj", ".fbx", ".las", ".laz", ".rad", ".lcc")  # models that cannot be read
 MIN_COUNT = 16  # Gaussians needed for statistics
@@ -95,7 +95,7 @@ def lines(report: dict[str, Any]) -> str:
         corners = (", ".join(f"{value:.4g}" for value in corner) for corner in (low, high))
         rows.append(f"  {'bounds':<12} ({next(corners)}) to ({next(corners)})")
     if origin := report.get("origin"):
-        rows.append(f"  {'origin':<12} {position_text(np.array(origin))}, to which the bounds are relative")
+        rows.append(f"  {'origin':<12} {format_position(np.array(origin))}, to which the bounds are relative")
     counts = report["degenerate"]
     rows.append(f"  {'degenerate':<12} " + ", ".join(f"{counts[name]} {label}" for name, label in DEGENERATE.items()))
     return "\n".join(rows)

@@ -26,7 +26,7 @@ from clsplat.scene.lookup import Missing
 from clsplat.scene.photographs import with_masks
 from clsplat.scene.scene import HOLDOUT, Background, Scene
 from clsplat.scene.view import Alpha
-from clsplat.scene.view_selection import Chosen, ChosenOrAuto, Split, ViewSelection
+from clsplat.scene.view_selection import Selection, SelectionOrAuto, Split, ViewSelection
 from clsplat.stages.optimize import Optimize
 from clsplat.training.memory import Harmonics
 from clsplat.training.stage import ON_HOST, Stage, Training
@@ -52,12 +52,12 @@ class SceneSettings(Settings):
     """Color behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
     """MiB of images on the device; default: a quarter of its memory."""
-    holdout: Chosen = HOLDOUT
+    holdout: Selection = HOLDOUT
     """Test views: every n-th image by name, starting with the first; 0: none; or {every, offset}, {names} or {file}.
     Names replace the split of a dataset that has one."""
     train: ViewSelection | None = None
     """Training views to use, such as {every: 4}; default: all."""
-    validation: ChosenOrAuto = 0
+    validation: SelectionOrAuto = 0
     """Training views held out to choose the best model (`optimize.keep`), as for `holdout`; auto: every 8th, starting
     with the fifth, and at least two."""
     extent: Annotated[float, Field(gt=0)] | None = None

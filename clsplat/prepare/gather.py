@@ -27,7 +27,7 @@ from clsplat.scene.images import (
     read_gray,
     write_exposures,
 )
-from clsplat.scene.lookup import unread_cameras
+from clsplat.scene.lookup import unsupported_cameras
 from clsplat.scene.multicamera import VIDEO_SUFFIXES
 from clsplat.scene.quality import is_blank
 from clsplat.scene.times_file import read_times, write_times
@@ -56,7 +56,7 @@ def list_photographs(folder: Path, excluded_folder: Path | None = None) -> list[
     Logs a warning about files in other formats.  Raises DataError when there are too few photographs.
     """
     names, unreadable_names = _photo_names(folder, excluded_folder)
-    for warning in (*_conversion_hints(unreadable_names), unread_cameras(folder)):
+    for warning in (*_conversion_hints(unreadable_names), unsupported_cameras(folder)):
         if warning:
             LOG.warning("%s: %s", folder, warning)
     require_photographs(folder, excluded_folder)

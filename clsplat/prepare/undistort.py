@@ -61,7 +61,7 @@ def _source_hash(view: View) -> str:
 def _with_lens(view: View, undefined_pixels: UndefinedPixels) -> View:
     if view.lens is None or undefined_pixels == "crop":
         return view
-    lens = intern_lens(replace(view.lens, whole=True))
+    lens = intern_lens(replace(view.lens, keep_border=True))
     return replace(view, lens=lens, camera=lens.pinhole)
 
 

@@ -67,8 +67,8 @@ class Camera:
 Floats = NDArray[np.float64]
 Distortion = Callable[..., tuple[Floats, Floats]]  # of (u, v, k), or of (x, y, k, z) for directions in models of WIDE
 BORDER_POINTS = 200  # per edge of a photograph
-MAX_ROUNDS = 50  # iterations of Newton's method
-MAX_ERROR = 1.0e-6  # of its result, normalized units
+MAX_ITERATIONS = 50  # of Newton's method
+MAX_ERROR = 1.0e-6  # of the result of Newton's method, normalized units
 MAX_DIFFERENCE = 1.0e-3  # of a ray after distortion and undistortion, normalized units
 MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond it, a pinhole image is mostly stretched edges
 MAX_GROWTH = 2.0  # size of an undistorted photograph, relative to the original
@@ -172,8 +172,8 @@ MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle or i
 RIM = 1.5  # px: samples at the edge of a fisheye's circle would mix with the dark pixels around it
 FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap
 FACE_GRID = 128  # directions along a side at which the visible part of a face is measured
-MIN_SHOWN = 0.02  # visible fraction of a face below which the face is left out
-ANGLES = 1801  # from 0 to 180 degrees
+MIN_VISIBLE = 0.02  # visible fraction of a face below which the face is left out
+ANGLE_COUNT = 1801  # number of samples from 0 to 180 degrees
 BLOCK = 1 << 20  # samples at a time
 # rotations from the camera of the photograph to that of the face; the rows are its right, down, and forward axes
 FACES: dict[str, Floats] = {
@@ -194,11 +194,11 @@ class Lens:
     height: int
     model: str
     params: tuple[float, ...]
-    whole: bool = False  # keep all of the photograph, with undefined pixels, instead of cropping them away
+    keep_border: bool = False  # keep the entire photograph, surrounded by undefined pixels, instead of cropping it
     face: str = field(default="", repr=False)  # a face of a wide photograph, from FACES; "": the photograph itself
 
     @property
-    def _split(self) -> tuple[float, float, float, float, tuple[float, ...]]:
+    def _intrinsics(self) -> tuple[float, float, float, float, tuple[float, ...]]:
         focal_count = MODELS[self.model][0]
         cx, cy = self.params[focal_count : focal_count + 2]
         return self.params[0], self.params[focal_count - 1], cx, cy, self.params[focal_count + 2 :]
@@ -206,13 +206,13 @@ class Lens:
     @property
     def has_distortion(self) -> bool:
         """Whether the lens has distortion; always true for fisheye lenses and panoramas."""
-        return "FISHEYE" in self.model or self.model == "EQUIRECTANGULAR" or any(self._split[4])
+        return "FISHEYE" in self.model or self.model == "EQUIRECTANGULAR" or any(self._intrinsics[4])
 
     @cached_property
     def _angles(self) -> tuple[Floats, float]:
         """The angles of view to the left, right, top and bottom, [4] rad, and the angle where the lens folds back."""
-        fx, fy, cx, cy, coefficients = self._split
-        angle, side_angles, fold_angles = np.linspace(0, np.pi, ANGLES), [], []
+        fx, fy, cx, cy, coefficients = self._intrinsics
+        angle, side_angles, fold_angles = np.linspace(0, np.pi, ANGLE_COUNT), [], []
         sizes = cx / fx, (self.width - cx) / fx, cy / fy, (self.height - cy) / fy
         for (x, y), size in zip(((-1, 0), (1, 0), (0, -1), (0, 1)), sizes, strict=True):
             with np.errstate(all="ignore"):
@@ -232,21 +232,21 @@ class Lens:
 
     @cached_property
     def faces(self) -> tuple["Lens", ...]:
-        """The lenses of the faces of a wide photograph: the front, and others of which MIN_SHOWN or more is visible."""
-        lenses = [intern_lens(replace(self, face=face, whole=self.model != "EQUIRECTANGULAR")) for face in FACES]
-        return tuple(lens for lens in lenses if lens.face == "front" or lens._visible_grid.mean() >= MIN_SHOWN)
+        """The lenses of the faces of a wide photograph: the front, and those with at least MIN_VISIBLE in view."""
+        lenses = [intern_lens(replace(self, face=face, keep_border=self.model != "EQUIRECTANGULAR")) for face in FACES]
+        return tuple(lens for lens in lenses if lens.face == "front" or lens._visible_grid.mean() >= MIN_VISIBLE)
 
     @cached_property
     def _visible_grid(self) -> NDArray[np.bool_]:
         """Which points of `_face_grid` are visible in the photograph, [FACE_GRID, FACE_GRID]."""
-        return self._sees(*_face_grid())
+        return self._is_visible(*_face_grid())
 
     def _directions(self, u: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
         """Convert normalized coordinates of the face to directions x, y, z in the camera of the photograph."""
         x, y, z = np.moveaxis(np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"], -1, 0)
         return x, y, z
 
-    def _sees(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
+    def _is_visible(self, u: Floats, v: Floats) -> NDArray[np.bool_]:
         """Return a mask of the rays, in normalized coordinates of the face, that are visible in the wide photograph."""
         if self.model == "EQUIRECTANGULAR":
             return np.ones(u.shape, bool)
@@ -255,7 +255,7 @@ class Lens:
         with np.errstate(all="ignore"):
             x, y = self.distort(x, y, z)
             is_inside = (x >= 0) & (y >= 0) & (x <= self.width) & (y <= self.height)
-        circle_angle = max(side_angles.min(), MIN_CIRCLE) - RIM / self._split[0]
+        circle_angle = max(side_angles.min(), MIN_CIRCLE) - RIM / self._intrinsics[0]
         return np.asarray(is_inside & (angle < min(fold_angle, circle_angle)))
 
     def shows_white(self, mask: NDArray[Any]) -> bool:
@@ -271,16 +271,16 @@ class Lens:
 
         At the center, its pixels are as large as those of the photograph.  Raises DataError for an implausible camera.
         """
-        focal = max(self._split[:2])
+        focal = max(self._intrinsics[:2])
         side = 2 * math.ceil(FACE_TANGENT * focal)
         long_side = max(self.width, self.height)
         if side > MAX_GROWTH * long_side or long_side > MAX_SOURCE:
             raise DataError(
-                f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._split[:2]}; expected "
-                f"at most {MAX_SOURCE} px per side and focal lengths that fit: calibrate the camera again"
+                f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._intrinsics[:2]}; "
+                f"expected at most {MAX_SOURCE} px per side and focal lengths that match: calibrate the camera again"
             )
         if not self._visible_grid.any():
-            raise self._error("shows nothing")
+            raise self._error("has no visible pixels")
         spans = [np.flatnonzero(self._visible_grid.any(axis=axis)) for axis in (0, 1)]  # columns, rows
         (x0, x1), (y0, y1) = (
             (max(0, int((i[0] - 1) / FACE_GRID * side)), min(side, int((i[-1] + 2) / FACE_GRID * side))) for i in spans
@@ -288,7 +288,7 @@ class Lens:
         return Camera(x1 - x0, y1 - y0, focal, focal, side / 2 - x0, side / 2 - y0)
 
     def _blocks(self, samples: int) -> Iterator[tuple[slice, Floats, Floats]]:
-        """Yield blocks of rows of the face, each with the normalized coordinates of its rays as from `_rays`."""
+        """Yield slices of rows of the face, each with the normalized coordinates of its rays (see `_rays`)."""
         block_height = max(1, BLOCK // (self.pinhole.width * samples**2))
         for row in range(0, self.pinhole.height, block_height):
             rows = slice(row, row + block_height)
@@ -310,7 +310,7 @@ class Lens:
 
     def distort(self, u: Floats, v: Floats, *z: Floats) -> tuple[Floats, Floats]:
         """Convert normalized coordinates, or directions (u, v, z) for models in WIDE, to pixel coordinates."""
-        fx, fy, cx, cy, coefficients = self._split
+        fx, fy, cx, cy, coefficients = self._intrinsics
         x, y = MODELS[self.model][1](u, v, coefficients, *z)
         return fx * x + cx, fy * y + cy
 
@@ -321,38 +321,38 @@ class Lens:
 
     def undistort(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Convert pixel coordinates to normalized coordinates by Newton's method; NaN where it does not converge."""
-        fx, fy, cx, cy, coefficients = self._split
+        fx, fy, cx, cy, coefficients = self._intrinsics
         distortion = MODELS[self.model][1]
         target = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
-        point, active = target.copy(), np.arange(x.size)
+        points, active = target.copy(), np.arange(x.size)
         with np.errstate(all="ignore"):
-            for _ in range(MAX_ROUNDS):
-                previous = point[:, active]
-                point[:, active] = current = _newton_step(distortion, coefficients, previous, target[:, active])
+            for _ in range(MAX_ITERATIONS):
+                previous = points[:, active]
+                points[:, active] = current = _newton_step(distortion, coefficients, previous, target[:, active])
                 # a point whose bits did not change has converged
                 active = active[(previous.view(np.int64) != current.view(np.int64)).any(axis=0)]
                 if not active.size:
                     break
-            error = np.abs(np.stack(distortion(point[0], point[1], coefficients)) - target)
-            u, v = np.where((error < MAX_ERROR).all(axis=0), point, np.nan)
+            error = np.abs(np.stack(distortion(points[0], points[1], coefficients)) - target)
+            u, v = np.where((error < MAX_ERROR).all(axis=0), points, np.nan)
         return u.reshape(x.shape), v.reshape(x.shape)
 
     @property
     def camera(self) -> Camera:
         """The camera without distortion, at the size of the photograph."""
-        return Camera(self.width, self.height, *self._split[:4])
+        return Camera(self.width, self.height, *self._intrinsics[:4])
 
     @cached_property
     def pinhole(self) -> Camera:
         """The camera of the undistorted photograph, with the same focal lengths.
 
-        Its image is the largest rectangle in which all pixels are defined.  With `whole`, it is the smallest rectangle
-        that contains the photograph, up to 60 degrees to each side and twice the size.  For a wide photograph, it is
-        the camera of the face.  Raises DataError if there is no such rectangle.
+        Its image is the largest rectangle in which all pixels are defined.  With `keep_border`, it is the smallest
+        rectangle that contains the photograph, up to 60 degrees to each side and twice the size.  For a wide
+        photograph, it is the camera of the face.  Raises DataError if there is no such rectangle.
         """
         if self.is_wide:
             return self._face_camera()
-        fx, fy, _, _, _ = self._split
+        fx, fy, _, _, _ = self._intrinsics
         x, y = np.linspace(0, self.width, BORDER_POINTS), np.linspace(0, self.height, BORDER_POINTS)
         left = self.undistort(np.zeros(BORDER_POINTS), y)[0]
         right = self.undistort(np.full(BORDER_POINTS, float(self.width)), y)[0]
@@ -361,14 +361,14 @@ class Lens:
         if not all(np.isfinite(side).any() for side in (left, right, top, bottom)):
             raise self._error("cannot be inverted")
         u0, u1, v0, v1 = np.nanmax(left), np.nanmin(right), np.nanmax(top), np.nanmin(bottom)
-        if self.whole:
+        if self.keep_border:
             border_u, border_v = np.concatenate([left, right]), np.concatenate([top, bottom])
             max_u, max_v = self.width * (MAX_GROWTH / 2) / fx, self.height * (MAX_GROWTH / 2) / fy
             u0, u1 = max(np.nanmin(border_u), -MAX_TANGENT, -max_u), min(np.nanmax(border_u), MAX_TANGENT, max_u)
             v0, v1 = max(np.nanmin(border_v), -MAX_TANGENT, -max_v), min(np.nanmax(border_v), MAX_TANGENT, max_v)
         width, height = int((u1 - u0) * fx), int((v1 - v0) * fy)
         if min(width, height) < 1:
-            raise self._error("leaves no pixel undistorted")
+            raise self._error("leaves no pixels after undistortion")
         return Camera(width, height, fx, fy, float(-u0 * fx), float(-v0 * fy))
 
     def _error(self, fault: str) -> DataError:
@@ -382,10 +382,10 @@ class Lens:
         return result.reshape(self.pinhole.height, self.pinhole.width, -1)
 
     @cached_property
-    def shown(self) -> NDArray[np.bool_]:
-        """A mask, [H, W], of the pixels of `pinhole` that the photograph shows: their rays map into it and back."""
+    def visible_pixels(self) -> NDArray[np.bool_]:
+        """A mask, [H, W], of the pixels of `pinhole` that the photograph covers: their rays map into it and back."""
         if self.is_wide:
-            return np.concatenate([self._sees(u, v) for _, u, v in self._blocks(1)])
+            return np.concatenate([self._is_visible(u, v) for _, u, v in self._blocks(1)])
         u, v = _rays(self.pinhole)
         x, y = self.distort(u, v)
         back_u, back_v = self.undistort(x, y)
@@ -402,7 +402,7 @@ def _rays(camera: Camera, rows: slice = slice(0, MAX_SIDE), samples: int = 1) ->
 
 
 def _face_grid() -> tuple[Floats, Floats]:
-    """Return the normalized coordinates of an even grid of points on a face, [FACE_GRID, FACE_GRID] each."""
+    """Return the normalized coordinates of a uniform grid of points on a face, [FACE_GRID, FACE_GRID] each."""
     positions = FACE_TANGENT * (2 * (np.arange(FACE_GRID) + 0.5) / FACE_GRID - 1)
     u, v = np.meshgrid(positions, positions)
     return u, v
@@ -413,9 +413,9 @@ def panorama_lens(width: int, height: int) -> Lens:
     return Lens(width, height, "EQUIRECTANGULAR", (width / math.tau, height / math.pi, width / 2, height / 2))
 
 
-def _newton_step(distortion: Distortion, k: Sequence[float], point: Floats, target: Floats) -> Floats:
+def _newton_step(distortion: Distortion, k: Sequence[float], points: Floats, target: Floats) -> Floats:
     """Return points, [2, M], after one step of Newton's method toward the points that are distorted to `target`."""
-    h, (u, v) = 1e-7, point
+    h, (u, v) = 1e-7, points
     x, y = distortion(u, v, k)
     xu, yu = distortion(u + h, v, k)
     xv, yv = distortion(u, v + h, k)
@@ -434,5 +434,5 @@ def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 @lru_cache(maxsize=64)
 def intern_lens(lens: Lens) -> Lens:
-    """Return the first lens that equals `lens`, so that views share its expensive properties `pinhole` and `shown`."""
+    """Return the first lens that equals `lens`, so that views share its expensive cached properties."""
     return lens

@@ -18,7 +18,7 @@ from clsplat.scene.colmap_writer import FILES, MODEL, write_colmap
 from clsplat.scene.images import EXPOSURES_FILE, is_image, write_exposures
 from clsplat.scene.points import write_points_ply
 from clsplat.scene.scene import Scene
-from clsplat.scene.transforms_json import POINTS, TRANSFORMS_FILE, JsonFrame, opengl_matrix
+from clsplat.scene.transforms_json import POINTS_FILE, TRANSFORMS_FILE, JsonFrame, opengl_matrix
 from clsplat.scene.view import NO_FILE, Floats, View, load_exposures, photo_lens
 
 # The views of a scene, named like their images below one folder.
@@ -48,7 +48,7 @@ def with_image_names(scene: Scene) -> Scene:
 
 
 def image_files(views: Sequence[View], folder: Path) -> dict[Path, Path]:
-    """Return the photograph of each view by its path in `folder`.  Raises DataError for a view without one."""
+    """Return the photograph of each view by the path of its copy in `folder`.  Raises DataError if there is none."""
     for view in views:
         if view.image_path == NO_FILE:
             raise DataError(f"the view {quote(view.name)} has no photo to copy; write only the cameras")
@@ -75,21 +75,21 @@ def write_inria(out: Path, scene: Scene) -> list[Path]:
 
     Warns if a principal point is not at the center of the image, where other programs assume it.
     """
-    write_text(out / INRIA_FILE, json.dumps([_camera(view, i) for i, view in enumerate(scene.views)], indent=1) + "\n")
+    write_text(out / INRIA_FILE, json.dumps([_entry(view, i) for i, view in enumerate(scene.views)], indent=1) + "\n")
     cameras = [view.camera for view in scene.views]
     offset = max(max(abs(c.cx - c.width / 2), abs(c.cy - c.height / 2)) for c in cameras)
     if offset > TOLERANCE:
         LOG.warning(
-            "%s: other programs assume the principal point at the center of the image; it is up to %.1f px away",
+            "%s: other programs assume that the principal point is the image center; it is up to %.1f px away",
             *(out / INRIA_FILE, offset),
         )
     return [out / INRIA_FILE]
 
 
-def _camera(view: View, number: int) -> dict[str, Any]:
+def _entry(view: View, index: int) -> dict[str, Any]:
     camera, pose = view.camera, view.world_to_camera
     return {
-        "id": number,
+        "id": index,
         "img_name": view.name,
         "width": camera.width,
         "height": camera.height,
@@ -109,11 +109,11 @@ def read_inria(path: Path) -> list[View]:
     """
     rows = read_json(path, "a cameras.json of 3DGS", limit=MAX_BYTES)
     if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_VIEWS or not all(isinstance(row, dict) for row in rows):
-        raise DataError(f"{path}: expected a list of 1 to {MAX_VIEWS} cameras, as 3DGS writes it")
-    return [_view(JsonFrame(path.parent, f"{path}: [{i}]", row), i) for i, row in enumerate(rows)]
+        raise DataError(f"{path}: expected a list of 1 to {MAX_VIEWS} cameras, as 3DGS writes it: export it again")
+    return [_make_view(JsonFrame(path.parent, f"{path}: [{i}]", row), i) for i, row in enumerate(rows)]
 
 
-def _view(frame: JsonFrame, number: int) -> View:
+def _make_view(frame: JsonFrame, index: int) -> View:
     width, height, fx, fy = (frame.number(key) or 0.0 for key in ("width", "height", "fx", "fy"))
     if min(width, height) < 1 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
         raise DataError(
@@ -123,15 +123,15 @@ def _view(frame: JsonFrame, number: int) -> View:
     cx, cy = frame.number("cx"), frame.number("cy")
     camera = Camera(int(width), int(height), fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
     name = frame.value("img_name")
-    rotation, position = _array(frame, "rotation", (3, 3)), _array(frame, "position", (3,))
+    rotation, position = _read_array(frame, "rotation", (3, 3)), _read_array(frame, "position", (3,))
     try:
         pose = np.column_stack([rotation.T, -rotation.T @ position])
-        return View(name if isinstance(name, str) else f"{number:05d}", camera, pose)
+        return View(name if isinstance(name, str) else f"{index:05d}", camera, pose)
     except PoseError as error:
         raise DataError(f"{frame.source}: {error}; remove that camera or export the file again") from error
 
 
-def _array(frame: JsonFrame, key: str, shape: tuple[int, ...]) -> Floats:
+def _read_array(frame: JsonFrame, key: str, shape: tuple[int, ...]) -> Floats:
     array = frame.array(key)
     if array.shape != shape or not np.isfinite(array).all():
         raise DataError(f"{frame.source}: {key} is {quote(frame.value(key))}; expected finite numbers of shape {shape}")
@@ -159,7 +159,7 @@ def write_nerfstudio(out: Path, scene: Scene) -> list[Path]:
 
     The test views are also listed as validation views, because nerfstudio evaluates those.  Raises OutputError.
     """
-    lenses = [_lens(view) for view in scene.views]
+    lenses = [_lens_fields(view) for view in scene.views]
     model, common_fields = lenses[0]["camera_model"], lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     matrices = [opengl_matrix(view.world_to_camera).tolist() for view in scene.views]
     frames = [
@@ -171,22 +171,22 @@ def write_nerfstudio(out: Path, scene: Scene) -> list[Path]:
         }
         for view, lens, matrix in zip(scene.views, lenses, matrices, strict=True)
     ]
-    table: dict[str, Any] = {"camera_model": model, **common_fields, "frames": frames}
+    document: dict[str, Any] = {"camera_model": model, **common_fields, "frames": frames}
     if scene.test:
         names = [f"{IMAGES}/{view.name}" for view in scene.views]
         train = [name for i, name in enumerate(names) if i not in scene.test]
         test = [name for i, name in enumerate(names) if i in scene.test]
-        table |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
+        document |= {"train_filenames": train, "val_filenames": test, "test_filenames": test}
     files = [out / TRANSFORMS_FILE]
     if scene.points is not None:
-        table["ply_file_path"] = POINTS
-        write_points_ply(out / POINTS, scene.points)
-        files.append(out / POINTS)
-    write_text(out / TRANSFORMS_FILE, json.dumps(table, indent=1) + "\n")
+        document["ply_file_path"] = POINTS_FILE
+        write_points_ply(out / POINTS_FILE, scene.points)
+        files.append(out / POINTS_FILE)
+    write_text(out / TRANSFORMS_FILE, json.dumps(document, indent=1) + "\n")
     return files
 
 
-def _lens(view: View) -> dict[str, Any]:
+def _lens_fields(view: View) -> dict[str, Any]:
     lens = photo_lens(view)
     model, names = DISTORTION[lens.model]
     camera, distortion = lens.camera, lens.params[len(lens.params) - len(names) :]
@@ -211,7 +211,7 @@ WRITERS: dict[str, Callable[[Path, Scene], list[Path]]] = {
 }
 OUTPUTS = {  # the files of each format
     "colmap": [MODEL / name for name in FILES],
-    "nerfstudio": [Path(TRANSFORMS_FILE), Path(POINTS)],
+    "nerfstudio": [Path(TRANSFORMS_FILE), Path(POINTS_FILE)],
     "inria": [Path(INRIA_FILE)],
 }
 UNDISTORTED = ("inria",)  # formats without lens distortion
@@ -229,9 +229,9 @@ def check_cameras(scene: Scene, format_: str) -> Scene:
         view_by_model[DISTORTION[model][0]] = view.name
     if len(view_by_model) > 1:
         model, name = view_by_model.popitem()
-        first = next(iter(view_by_model))
+        other_model = next(iter(view_by_model))
         raise DataError(
-            f"{name}: has the camera model {model}, other views have {first}; nerfstudio allows only one; {REMEDY}"
+            f"{name}: has the camera model {model}, other views have {other_model}; nerfstudio allows one; {REMEDY}"
         )
     return renamed_scene
 
@@ -257,11 +257,11 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     sidecars = [out / IMAGES / EXPOSURES_FILE] if copies else []
     for path in () if overwrite else (*(out / file for file in OUTPUTS[format_]), *copies, *sidecars):
         if path_exists(path):
-            raise ConfigError(f"{path}: exists; give another folder for the cameras, or remove it")
+            raise ConfigError(f"{path}: exists; choose another folder, or remove the file")
     files = WRITERS[format_](out, renamed_scene)
     if format_ != SPLIT and scene.test:
         test_views = f"{len(scene.test)} of {len(scene.views)}"
-        LOG.warning("%s: %s does not store which views are for testing, %s; %s does", out, format_, test_views, SPLIT)
+        LOG.warning("%s: %s does not store which %s views are test views; %s does", out, format_, test_views, SPLIT)
     if format_ != SPLIT and any(view.time is not None for view in scene.views):
         LOG.warning("%s: %s does not store the times of the views; %s does", out, format_, SPLIT)
     if format_ != TRACKS and copies and scene.tracks is not None:

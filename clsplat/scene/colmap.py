@@ -28,7 +28,7 @@ from clsplat.scene.view import NO_FILE, View, fit_to_photograph
 
 # Define the records of a COLMAP model: camera models, cameras and images.
 
-# Camera models in order of their ids, with the number of parameters (COLMAP 4, sensor/models.h).
+# Camera models in order of their IDs, with the number of parameters (COLMAP 4, sensor/models.h).
 PARAMETERS = {
     **{"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8},
     **{"FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12},
@@ -81,10 +81,10 @@ def decode(source: str, data: bytes) -> str:
 
 # Read the text files of a COLMAP model.
 
-LARGEST_ID = 2**63 - 1
+MAX_ID = 2**63 - 1
 
 
-def cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
+def read_cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
     """Yield the ID and the record of each camera.  Raises DataError, like all functions here, for a damaged file."""
     for source, line in _lines(path):
         if line:
@@ -96,14 +96,14 @@ def cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
             yield camera_id, CameraRecord(source, model, width, height, tuple(params))
 
 
-def images_text(path: Path) -> Iterator[ImageRecord]:
+def read_images_text(path: Path) -> Iterator[ImageRecord]:
     """Yield the registered images, in the order of the file."""
     layout = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     types = (int, *[float] * 7, int, str)
     image: ImageRecord | None = None  # its points may follow on the next line
     for source, line in _lines(path):
         if image and _is_points2d(line):
-            points, pixels = _points2d(line)
+            points, pixels = _parse_points2d(line)
             yield image._replace(points=points, pixels=pixels)
             image = None
         elif line:
@@ -121,7 +121,7 @@ def _is_points2d(line: str) -> bool:
     return len(fields) % 3 == 0 and (not fields or fields[-1].lstrip("-").isdecimal())
 
 
-def _points2d(line: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _parse_points2d(line: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Parse a line of 2D points: return the IDs of their 3D points, [K], and their positions, [K, 2] px."""
     fields = line.split()
     indices = [i for i in range(2, len(fields), 3) if fields[i].isdecimal()]
@@ -137,7 +137,7 @@ def _parse_coordinate(text: str) -> float:
         return math.nan
 
 
-def points_text(path: Path) -> PointTable:
+def read_points_text(path: Path) -> PointTable:
     """Return all points with their reprojection errors."""
     types = (_parse_id, float, float, float, _parse_byte, _parse_byte, _parse_byte, float)
     layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
@@ -168,7 +168,7 @@ def _convert(source: str, fields: list[str], types: Sequence[Callable[[str], Any
 
 def _parse_id(text: str) -> int:
     """Parse the ID of a point, clamped to the range that COLMAP uses.  -1 means no point."""
-    return min(max(int(text), -1), LARGEST_ID)
+    return min(max(int(text), -1), MAX_ID)
 
 
 def _parse_byte(text: str) -> int:
@@ -183,7 +183,7 @@ POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
 POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 
 
-class _Binary:
+class _BinaryFile:
     """A reader of binary values.  Raises DataError if the file ends too early."""
 
     def __init__(self, path: Path) -> None:
@@ -196,7 +196,7 @@ class _Binary:
         return f"{self.path}: byte {self.offset}"
 
     def skip(self, size: int, label: str) -> int:
-        """Skip `size` bytes and return the offset of the first byte.  label: describes them in messages."""
+        """Skip `size` bytes and return the offset of the first byte.  label: their name in messages."""
         available = len(self.data) - self.offset
         if size > available:
             raise DataError(
@@ -208,19 +208,19 @@ class _Binary:
     def read(self, layout: str, label: str) -> tuple[Any, ...]:
         return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout), label))
 
-    def count(self, stride: int, label: str) -> int:
+    def read_count(self, stride: int, label: str) -> int:
         """Read the number of records, and check that the file can hold records of at least `stride` bytes."""
         (count,) = self.read("<Q", f"the number of {label}")
         self.offset = self.skip(count * stride, f"{count} {label}")
         return int(count)
 
-    def text(self, label: str) -> str:
+    def read_text(self, label: str) -> str:
         """Read UTF-8 text up to the next zero byte."""
         source, end = self.source, self.data.find(b"\0", self.offset)
         start = self.skip((end if end >= 0 else len(self.data)) + 1 - self.offset, label)
         return decode(source, self.data[start:end])
 
-    def finish(self) -> None:
+    def require_end(self) -> None:
         if self.offset < len(self.data):
             raise DataError(
                 f"{self.source}: the file is damaged: {len(self.data) - self.offset} bytes follow the last record; "
@@ -228,41 +228,41 @@ class _Binary:
             )
 
 
-def cameras_binary(path: Path) -> Iterator[tuple[int, CameraRecord]]:
+def read_cameras_binary(path: Path) -> Iterator[tuple[int, CameraRecord]]:
     """Yield the ID and the record of each camera.  Raises DataError, like all functions here, for a damaged file."""
-    file = _Binary(path)
-    for _ in range(file.count(24, "cameras")):
+    file = _BinaryFile(path)
+    for _ in range(file.read_count(24, "cameras")):
         source = file.source
         camera_id, model, width, height = file.read("<IiQQ", "a camera")
         name = MODELS[model] if 0 <= model < len(MODELS) else str(model)
         params = file.read(f"<{parameter_count(source, name)}d", "camera parameters")
         yield camera_id, CameraRecord(source, name, width, height, params)
-    file.finish()
+    file.require_end()
 
 
-def images_binary(path: Path) -> Iterator[ImageRecord]:
+def read_images_binary(path: Path) -> Iterator[ImageRecord]:
     """Yield the registered images, in the order of the file."""
-    file = _Binary(path)
-    for _ in range(file.count(73, "images")):
+    file = _BinaryFile(path)
+    for _ in range(file.read_count(73, "images")):
         source = file.source
         _, *pose, camera = file.read("<I7dI", "an image")
-        name = file.text("an image name")
-        count = file.count(POINT2D.itemsize, "2D points")
+        name = file.read_text("an image name")
+        count = file.read_count(POINT2D.itemsize, "2D points")
         start = file.skip(POINT2D.itemsize * count, "2D points")
         points = np.frombuffer(file.data, POINT2D, count, start)
         points = points[points["point"] >= 0]
         yield ImageRecord(source, name, camera, tuple(pose[:4]), tuple(pose[4:]), points["point"], points["xy"])
-    file.finish()
+    file.require_end()
 
 
-def points_binary(path: Path) -> PointTable:
+def read_points_binary(path: Path) -> PointTable:
     """Return all points with their reprojection errors."""
-    file = _Binary(path)
-    starts = np.empty(file.count(POINT.itemsize, "points"), np.int64)
+    file = _BinaryFile(path)
+    starts = np.empty(file.read_count(POINT.itemsize, "points"), np.int64)
     for i in range(len(starts)):  # records have different lengths because of their tracks
         starts[i] = file.skip(POINT.itemsize - 8, "a point")
-        file.skip(8 * file.count(8, "track elements"), "track elements")
-    file.finish()
+        file.skip(8 * file.read_count(8, "track elements"), "track elements")
+    file.require_end()
     if len(starts) == 0:
         return PointTable(path, np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
     records = np.lib.stride_tricks.sliding_window_view(np.frombuffer(file.data, np.uint8), POINT.itemsize)
@@ -283,9 +283,9 @@ def read_cameras(folder: Path) -> dict[int, CameraRecord]:
     """Return the cameras of a model by ID.  Raises DataError, like all functions here, for a damaged file."""
     file = _require_file(folder, "cameras")
     cameras: dict[int, CameraRecord] = {}
-    for camera_id, camera in cameras_binary(file) if file.suffix == ".bin" else cameras_text(file):
+    for camera_id, camera in read_cameras_binary(file) if file.suffix == ".bin" else read_cameras_text(file):
         if camera_id in cameras:
-            raise DataError(f"{camera.source}: a second camera {camera_id}; expected different ids: {REMEDY}")
+            raise DataError(f"{camera.source}: camera ID {camera_id} is not unique; {REMEDY}")
         cameras[camera_id] = camera
     return cameras
 
@@ -293,7 +293,7 @@ def read_cameras(folder: Path) -> dict[int, CameraRecord]:
 def read_images(folder: Path) -> list[ImageRecord]:
     """Return the registered images of a model, in the order of the file."""
     file = _require_file(folder, "images")
-    return list(images_binary(file) if file.suffix == ".bin" else images_text(file))
+    return list(read_images_binary(file) if file.suffix == ".bin" else read_images_text(file))
 
 
 def read_point_table(folder: Path) -> PointTable | None:
@@ -301,7 +301,7 @@ def read_point_table(folder: Path) -> PointTable | None:
     file = find_file(folder, "points3D")
     if file is None:
         return None
-    return points_binary(file) if file.suffix == ".bin" else points_text(file)
+    return read_points_binary(file) if file.suffix == ".bin" else read_points_text(file)
 
 
 def _require_file(folder: Path, stem: str) -> Path:
@@ -330,9 +330,9 @@ class ColmapReader(Reader):
         return bool(find_models(path))
 
     def read(self, path: Path, holdout: int) -> Scene:
-        model, images = _largest_model(path)
+        model, images = _read_largest_model(path)
         cameras = read_cameras(model)
-        images, files, masks = self._files(path, images)
+        images, files, masks = self._locate(path, images)
         views = [make_view(*args) for args in zip(images, repeat(cameras), files.paths, masks, strict=False)]
         views = sorted((views[i] for i in files.existing_indices(path, self.missing)), key=lambda view: view.name)
         views, table = add_times(views, files.folder), read_point_table(model)
@@ -350,7 +350,7 @@ class ColmapReader(Reader):
         model, images = models[0]
         cameras = parts.attempt(read_cameras, model)
         parts.points = parts.attempt(read_point_table, model)
-        images, files, masks = self._files(parts.path, images)
+        images, files, masks = self._locate(parts.path, images)
         parts.image_folder = files.folder
         parts.expect(files)
         for image, file, mask in zip(images, files.paths, masks, strict=True) if cameras else []:
@@ -359,7 +359,7 @@ class ColmapReader(Reader):
                 parts.models[view.name] = cameras[image.camera].model if cameras else ""
                 parts.observed[view.name] = len(image.points)
 
-    def _files(self, path: Path, images: list[ImageRecord]) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
+    def _locate(self, path: Path, images: list[ImageRecord]) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
         """Return the images, renamed to match their files, and the files and masks of the images."""
         folder = image_folder(path, self.root)
         root = self.root if self.root and folder.is_relative_to(self.root) else folder.parent
@@ -370,7 +370,7 @@ class ColmapReader(Reader):
 
 def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
     """Return a view without a photograph for each image of the largest model, and the points."""
-    model, images = _largest_model(path)
+    model, images = _read_largest_model(path)
     cameras, table = read_cameras(model), read_point_table(model)
     return [make_view(image, cameras) for image in images], table.cloud() if table else None
 
@@ -382,13 +382,13 @@ def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequenc
     order = np.argsort(ids, kind="stable")
     track_rows, residuals, by_name = {}, {}, {view.name: view for view in views}
     for image in images:
-        image_ids, first = np.unique(image.points, return_index=True)
+        image_ids, first_indices = np.unique(image.points, return_index=True)
         nearest = np.minimum(np.searchsorted(ids[order], image_ids), max(len(ids) - 1, 0))
         is_match = ids[order][nearest] == image_ids if len(ids) else np.zeros(len(image_ids), bool)
         rows = track_rows[image.name] = order[nearest[is_match]] if len(ids) else np.empty(0, np.int64)
         view = by_name.get(image.name)
         if len(rows) and len(image.pixels) and view and not (view.lens and view.lens.is_wide):
-            residuals[image.name] = reprojection_residuals(view, positions[rows], image.pixels[first[is_match]])
+            residuals[image.name] = reprojection_residuals(view, positions[rows], image.pixels[first_indices[is_match]])
     return Tracks(positions, track_rows, residuals) if any(map(len, track_rows.values())) else None
 
 
@@ -397,11 +397,11 @@ def find_models(path: Path) -> list[Path]:
     sparse = path / "sparse"
     folders = [path, sparse, *(sorted(sparse.iterdir()) if sparse.is_dir() else [])]
     counts = {folder: sum(find_file(folder, stem) is not None for stem in ("cameras", "images")) for folder in folders}
-    complete = [folder for folder, count in counts.items() if count == 2]
-    return complete or [folder for folder, count in counts.items() if count == 1 and find_file(folder, "points3D")]
+    models = [folder for folder, count in counts.items() if count == 2]
+    return models or [folder for folder, count in counts.items() if count == 1 and find_file(folder, "points3D")]
 
 
-def _largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
+def _read_largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     models = [(folder, read_images(folder)) for folder in find_models(path)]
     if not models:
         raise DataError(
@@ -429,21 +429,21 @@ def make_view(
     """Return the view of an image.  Raises DataError if the image or its camera is invalid."""
     if image.camera not in cameras:
         raise DataError(
-            f"{image.source}: image {quote(image.name)} has camera {image.camera}; expected one of the cameras file, "
+            f"{image.source}: image {quote(image.name)} has camera {image.camera}; expected an ID in the cameras file, "
             f"{sorted(cameras)[:8]}: {REMEDY}"
         )
     try:
         pose = pose_matrix(image.quaternion, image.translation)
     except ValueError as error:
         raise DataError(
-            f"{image.source}: the pose of {quote(image.name)} is {error}: remove that image or {REMEDY}"
+            f"{image.source}: the pose of {quote(image.name)} is {error}: remove the image or {REMEDY}"
         ) from error
-    lens = intern_lens(_lens(image.camera, cameras[image.camera]))
+    lens = intern_lens(_make_lens(image.camera, cameras[image.camera]))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
     return View(image.name, camera, pose, file, mask, lens=distortion)
 
 
-def _lens(camera_id: int, camera: CameraRecord) -> Lens:
+def _make_lens(camera_id: int, camera: CameraRecord) -> Lens:
     """Return the lens of a camera.  Raises DataError for an invalid size or parameter."""
     size, focals = (camera.width, camera.height), camera.params[: LENS_MODELS[camera.model][0]]
     is_valid = min(size) > 0 and max(size) <= MAX_SIDE and min(focals) >= MIN_FOCAL

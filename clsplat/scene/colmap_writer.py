@@ -34,30 +34,30 @@ def write_model(folder: Path, views: Sequence[View], points: PointCloud | None, 
     """
     lenses = [photo_lens(view) for view in views]
     camera_ids = {lens: camera_id for camera_id, lens in enumerate(dict.fromkeys(lenses), 1)}
-    points2d = [_points2d(points, view, tracks) for view in views]
+    points2d = [_project_points2d(points, view, tracks) for view in views]
     images = zip(views, lenses, points2d, strict=True)
     contents = (
-        [_camera(camera_id, lens) for lens, camera_id in camera_ids.items()],
-        [_image(i, view, camera_ids[lens], table) for i, (view, lens, table) in enumerate(images, 1)],
-        [] if points is None else _points(points, points2d),
+        [_pack_camera(camera_id, lens) for lens, camera_id in camera_ids.items()],
+        [_pack_image(i, view, camera_ids[lens], table) for i, (view, lens, table) in enumerate(images, 1)],
+        [] if points is None else _pack_points(points, points2d),
     )
     for name, records in zip(FILES, contents, strict=True):
         with open_atomic(folder / name) as file:
             file.write(struct.pack("<Q", len(records)) + b"".join(records))
 
 
-def _camera(camera_id: int, lens: Lens) -> bytes:
+def _pack_camera(camera_id: int, lens: Lens) -> bytes:
     values = camera_id, MODELS.index(lens.model), lens.width, lens.height, *lens.params
     return struct.pack(f"<IiQQ{len(lens.params)}d", *values)
 
 
-def _image(image_id: int, view: View, camera_id: int, points2d: NDArray[Any]) -> bytes:
+def _pack_image(image_id: int, view: View, camera_id: int, points2d: NDArray[Any]) -> bytes:
     quaternion = unit_quaternions(view.world_to_camera[:, :3])
     pose = struct.pack("<I7dI", image_id, *quaternion, *view.world_to_camera[:, 3], camera_id)
     return pose + view.name.encode() + b"\0" + struct.pack("<Q", len(points2d)) + points2d.tobytes()
 
 
-def _points2d(points: PointCloud | None, view: View, tracks: Tracks | None) -> NDArray[Any]:
+def _project_points2d(points: PointCloud | None, view: View, tracks: Tracks | None) -> NDArray[Any]:
     """Return the 2D points of a view, one for each of its tracked points in front of the camera."""
     if points is None or tracks is None or view.name not in tracks.rows:
         return np.zeros(0, POINT2D)
@@ -69,7 +69,7 @@ def _points2d(points: PointCloud | None, view: View, tracks: Tracks | None) -> N
     return table
 
 
-def _points(points: PointCloud, points2d: Sequence[NDArray[Any]]) -> list[bytes]:
+def _pack_points(points: PointCloud, points2d: Sequence[NDArray[Any]]) -> list[bytes]:
     """Return the record of each point; points2d: the 2D points of each image."""
     tracks: list[bytes] = [b""] * len(points)
     for image_id, table in enumerate(points2d, 1):

@@ -10,7 +10,7 @@ from clsplat.formats.table import detect as model_format
 from clsplat.scene.colmap import ColmapReader, find_models, read_images
 from clsplat.scene.images import is_image
 from clsplat.scene.llff import LlffReader
-from clsplat.scene.lookup import unread_cameras, walk_folders
+from clsplat.scene.lookup import unsupported_cameras, walk_folders
 from clsplat.scene.multicamera import MulticameraReader
 from clsplat.scene.reader import Reader, reader_classes
 from clsplat.scene.scene import HOLDOUT, Scene
@@ -26,18 +26,18 @@ def readers() -> list[Reader]:
     Raises ConfigError if two readers have the same name.
     """
 
-    def rank(kind: type[Reader]) -> int:
+    def rank(reader_type: type[Reader]) -> int:
         """Return the rank of a shipped reader or a subclass of it; other readers come last."""
-        return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(kind, shipped)), len(PRECEDENCE))
+        return next((i for i, shipped in enumerate(PRECEDENCE) if issubclass(reader_type, shipped)), len(PRECEDENCE))
 
-    by_name: dict[str, Reader] = {}
-    for reader in [kind() for kind in sorted(reader_classes(), key=rank)]:
-        if reader.name in by_name:
-            kinds = (type(by_name[reader.name]), type(reader))
-            classes = " and ".join(f"{kind.__module__}.{kind.__name__}" for kind in kinds)
+    readers_by_name: dict[str, Reader] = {}
+    for reader in [reader_type() for reader_type in sorted(reader_classes(), key=rank)]:
+        if reader.name in readers_by_name:
+            duplicates = (type(readers_by_name[reader.name]), type(reader))
+            classes = " and ".join(f"{reader_type.__module__}.{reader_type.__name__}" for reader_type in duplicates)
             raise ConfigError(f"two readers have the name '{reader.name}': {classes}; rename one")
-        by_name[reader.name] = reader
-    return list(by_name.values())
+        readers_by_name[reader.name] = reader
+    return list(readers_by_name.values())
 
 
 def format_names() -> str:
@@ -52,13 +52,13 @@ def find_reader(path: Path) -> Reader | None:
 
 
 MAX_DEPTH = 2  # levels of folders below a scene in which its dataset may be
-DEEPEST = 4  # levels to search if there is none up to MAX_DEPTH
+FALLBACK_DEPTH = 4  # levels to search if there is no dataset up to MAX_DEPTH
 logger = logging.getLogger("clsplat")
 
 
 def find_datasets(path: Path) -> list[Reader]:
     """Return the reader of the dataset in a folder, otherwise the readers of all datasets in its subfolders."""
-    return _find_datasets(path, MAX_DEPTH) or _find_datasets(path, DEEPEST)
+    return _find_datasets(path, MAX_DEPTH) or _find_datasets(path, FALLBACK_DEPTH)
 
 
 def _find_datasets(path: Path, depth: int) -> list[Reader]:
@@ -90,7 +90,7 @@ def find_dataset(path: Path) -> Reader | None:
     if sum(has_images) > 1 or not all(names[i] & names[best] for i in range(len(names))):
         candidates = first_few([f"{reader.folder.relative_to(path).as_posix()} ({reader.name})" for reader in datasets])
         raise DataError(f"{path}: has {len(datasets)} datasets in its subfolders: {candidates}; use one of these")
-    datasets[best].choice = f", of {len(datasets)} models of these photos"
+    datasets[best].choice = f", out of {len(datasets)} models of these photos"
     return datasets[best]
 
 
@@ -125,11 +125,11 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
             logger.info("%s: %s", path, reader.note)
         reader.missing = split.missing
         return split.apply(replace(reader.read(reader.folder, split.reader_holdout), path=path))
-    unread_text = f"; {text}" if (text := unread_cameras(path)) else ""
+    note = f"; {message}" if (message := unsupported_cameras(path)) else ""
     if any(is_image(file) for file in path.iterdir()):
         parent = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
         remedy = f"the cameras are in {parent}: give that folder" if parent else remedy
-        raise DataError(f"{path}: photos without cameras; {remedy}{unread_text}")
+        raise DataError(f"{path}: photos without cameras; {remedy}{note}")
     formats = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
-    raise DataError(f"{path}: no dataset found; looked for {formats}{unread_text}")
+    raise DataError(f"{path}: no dataset found; looked for {formats}{note}")

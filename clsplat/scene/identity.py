@@ -30,7 +30,7 @@ from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 MAX_THREADS = 8  # each keeps one photograph in memory
 MAX_CACHE_BYTES = 1 << 24  # about 200 000 photographs
 MAX_NAMES = 3  # in a message
-Entry = tuple[int, int, int]  # width, height, and flags as bits: is blank, excludes every pixel as a mask, transparent
+Entry = tuple[int, int, int]  # width, height, and flags as bits: blank, excludes every pixel as a mask, transparent
 
 
 @dataclass
@@ -40,15 +40,15 @@ class ImageFile:
     digest: str = ""  # SHA-256 of the content; "" if the file cannot be read
     size: Size | None = None  # as stored; None if the file cannot be decoded
     orientation: int = 1  # from EXIF; 1: upright
-    cut: bool = False  # whether the end of the file is missing
+    is_truncated: bool = False  # whether the end of the file is missing
     fault: str = ""  # the error that training would report
-    blank: bool = False  # whether the image is black, of a single color, or transparent
-    excluded: bool = False  # whether the image, as a mask, excludes every pixel
-    transparent: bool = False  # whether the alpha channel excludes every pixel
+    is_blank: bool = False  # whether the image is black, of a single color, or transparent
+    excludes_all: bool = False  # whether the image, as a mask, excludes every pixel
+    is_transparent: bool = False  # whether the alpha channel excludes every pixel
 
 
 def decode_all(views: Iterable[View]) -> dict[Path, ImageFile]:
-    """Decode the photographs and masks of views in threads, and check their sizes against the cameras, as load_image.
+    """Decode the photographs and masks of views in threads, and check that their sizes fit the cameras.
 
     Returns the result for each file; a file that several views share is read once.  Views without files are skipped.
     """
@@ -77,7 +77,7 @@ def require_decodable(path: Path, files: Mapping[Path, ImageFile]) -> None:
     if faults:
         examples = "; ".join(f"{file} ({fault})" for file, fault in list(faults.items())[:MAX_NAMES])
         more = "; …" if len(faults) > MAX_NAMES else ""
-        raise DataError(f"{path}: {len(faults)} of {len(files)} image files cannot be trained on: {examples}{more}")
+        raise DataError(f"{path}: {len(faults)} of {len(files)} image files cannot be used: {examples}{more}")
 
 
 def require_content(path: Path, views: Sequence[View], files: Mapping[Path, ImageFile]) -> list[str]:
@@ -85,25 +85,25 @@ def require_content(path: Path, views: Sequence[View], files: Mapping[Path, Imag
 
     Raises DataError, as training would, if all photographs are blank or if a mask excludes an entire photograph.
     """
-    masked = [view for view in views if _is_excluded(view, files)]
-    if masked:
-        examples = first_few([f"{view.name} ({view.mask_path or view.image_path})" for view in masked])
+    masked_views = [view for view in views if _is_excluded(view, files)]
+    if masked_views:
+        examples = first_few([f"{view.name} ({view.mask_path or view.image_path})" for view in masked_views])
         raise DataError(
-            f"{path}: masks exclude every pixel of {pluralize(len(masked), 'photo')}: {examples}; masks must be "
+            f"{path}: masks exclude every pixel of {pluralize(len(masked_views), 'photo')}: {examples}; masks must be "
             "white (255) in usable pixels: correct them, or remove these photos"
         )
-    blank = [view.name for view in views if view.image_path in files and files[view.image_path].blank]
-    if blank and len(blank) == len(views):
+    blank_names = [view.name for view in views if view.image_path in files and files[view.image_path].is_blank]
+    if blank_names and len(blank_names) == len(views):
         raise DataError(
-            f"{path}: all photos are blank: {first_few(blank)} are black, of a single color, or transparent; "
+            f"{path}: all photos are blank: {first_few(blank_names)} are black, of a single color, or transparent; "
             "export them again"
         )
-    return blank
+    return blank_names
 
 
 def _is_excluded(view: View, files: Mapping[Path, ImageFile]) -> bool:
     mask, image = (files.get(file) if file else None for file in (view.mask_path, view.image_path))
-    return bool((mask and mask.excluded) or (view.alpha == "mask" and image and image.transparent))
+    return bool((mask and mask.excludes_all) or (view.alpha == "mask" and image and image.is_transparent))
 
 
 def _examine(file: Path, views: list[View], result: ImageFile, cache: "DecodedSizes") -> None:
@@ -111,11 +111,11 @@ def _examine(file: Path, views: list[View], result: ImageFile, cache: "DecodedSi
         data = read_file(file, "an image", limit=MAX_BYTES)
         result.digest = hashlib.sha256(data).hexdigest()
         if header := parse_header(data, data[-TAIL_SIZE:], lambda: data):
-            result.orientation, result.cut = header.orientation, not header.complete
-        result.size = cache.size(result.digest, data, file)
-        result.blank, result.excluded, result.transparent = cache.contents(result.digest)
+            result.orientation, result.is_truncated = header.orientation, not header.is_complete
+        result.size = cache.get_size(result.digest, data, file)
+        result.is_blank, result.excludes_all, result.is_transparent = cache.flags(result.digest)
         for view in views:
-            needs_rotation(view, file, lambda upright: cache.size(result.digest, data, file, upright))
+            needs_rotation(view, file, lambda upright: cache.get_size(result.digest, data, file, upright))
     except DataError as error:
         result.fault = str(error)
 
@@ -133,9 +133,9 @@ class DecodedSizes:
         with suppress(DataError, OutputError):
             self.path = cache_folder() / "decoded" / f"opencv-{cv2.__version__}-contents.txt"
             lines = read_file(self.path, limit=MAX_CACHE_BYTES).splitlines(keepends=True)
-            self._entries = dict(filter(None, map(_entry, lines)))
+            self._entries = dict(filter(None, map(_parse_entry, lines)))
 
-    def size(self, digest: str, data: bytes, file: Path, upright: bool = False) -> Size:
+    def get_size(self, digest: str, data: bytes, file: Path, upright: bool = False) -> Size:
         """Return (width, height) of an image file, px, and decode `data` if it is not cached.  Raises DataError."""
         key = f"{digest}-upright" if upright else digest
         if key not in self._entries:
@@ -146,7 +146,7 @@ class DecodedSizes:
             self._entries[key] = self._new[key] = width, height, sum(2**i for i, is_set in enumerate(flags) if is_set)
         return self._entries[key][:2]
 
-    def contents(self, digest: str) -> tuple[bool, bool, bool]:
+    def flags(self, digest: str) -> tuple[bool, bool, bool]:
         """Return three flags of a cached image: blank, excluding all pixels as a mask, and transparent."""
         bits = self._entries[digest][2]
         return bool(bits & 1), bool(bits & 2), bool(bits & 4)
@@ -163,7 +163,7 @@ class DecodedSizes:
                 file.write(lines.encode())
 
 
-def _entry(line: bytes) -> tuple[str, Entry] | None:
+def _parse_entry(line: bytes) -> tuple[str, Entry] | None:
     """Return the key and the entry on a line of the cache file; None if the line is incomplete or damaged."""
     fields = line.split()
     is_complete = len(fields) == 4 and line.endswith(b"\n")
@@ -191,7 +191,7 @@ class Identity:
     def from_scene(cls, scene: Scene, files: Mapping[Path, ImageFile]) -> "Identity":
         """Return the identity of a scene; files: the results of `decode_all`."""
         train, test, fold = (
-            {view.name: _row(view, files, scene.origin) for view in scene.split(name)} for name in SPLITS
+            {view.name: _view_hashes(view, files, scene.origin) for view in scene.split(name)} for name in SPLITS
         )
         points = scene.points
         arrays = [points.positions, points.colors, points.times] if points else []
@@ -204,22 +204,22 @@ class Identity:
         values += [list(self.validation.items())] if self.validation else []
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
-    def changes(self, before: "Identity") -> list[str]:
-        """List the changes since `before`, with counts and the first few names: 'the photo of 2 views (…)'."""
+    def changes(self, previous: "Identity") -> list[str]:
+        """List the changes since `previous`, with counts and the first few names: 'the photo of 2 views (…)'."""
         changes = []
-        old, new = before._rows, self._rows
+        old, new = previous._rows, self._rows
         for key in ("photograph", "mask", "camera", "time"):
             names = [name for name in old if name in new and old[name].get(key) != new[name].get(key)]
             noun = "photo" if key == "photograph" else key
             changes += [f"the {noun} of {_list_views(names)}"] if names else []
-        moved_names = [name for name in old if name in new and before._splits(name) != self._splits(name)]
+        moved_names = [name for name in old if name in new and previous._splits(name) != self._splits(name)]
         removed, added = [name for name in old if name not in new], [name for name in new if name not in old]
         changes += [f"the split of {_list_views(moved_names)}"] if moved_names else []
         changes += [f"{_list_views(removed)}, removed"] if removed else []
         changes += [f"{_list_views(added)}, added"] if added else []
-        if not (moved_names or removed or added) and list(self.train) != list(before.train):
+        if not (moved_names or removed or added) and list(self.train) != list(previous.train):
             changes.append("the order of the training views")
-        return changes + (["the points"] if self.points != before.points else [])
+        return changes + (["the points"] if self.points != previous.points else [])
 
     @property
     def _rows(self) -> dict[str, Row]:
@@ -245,10 +245,10 @@ class Identity:
         raise ValueError("damaged")
 
 
-def _row(view: View, files: Mapping[Path, ImageFile], origin: Floats) -> Row:
+def _view_hashes(view: View, files: Mapping[Path, ImageFile], origin: Floats) -> Row:
     camera, lens = view.camera, view.lens
     values = [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, view.downscale]
-    distortion = [lens.model, lens.width, lens.height, lens.whole, *map(float, lens.params)] if lens else []
+    distortion = [lens.model, lens.width, lens.height, lens.keep_border, *map(float, lens.params)] if lens else []
     return {
         "photograph": _photograph_digest(view, files),
         "mask": files[view.mask_path].digest if view.mask_path else "",

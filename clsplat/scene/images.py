@@ -24,17 +24,17 @@ HEAD_SIZE, TAIL_SIZE = 1 << 18, 1 << 16  # bytes to read at either end
 PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 JPEG, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 FRAME_MARKERS = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # markers of a frame header
-ORIENTATION = 0x0112  # Exif tag
+ORIENTATION = 0x0112  # EXIF tag
 
 
 @dataclass(frozen=True)
 class Header:
-    """The stored size of an image in pixels, its Exif orientation (1: upright), and whether the file is complete."""
+    """The stored size of an image in pixels, its EXIF orientation (1: upright), and whether the file is complete."""
 
     width: int
     height: int
     orientation: int = 1
-    complete: bool = True
+    is_complete: bool = True
 
 
 def parse_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Header | None:
@@ -46,7 +46,7 @@ def parse_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Hea
     header = None
     if head.startswith(PNG) and head[12:16] == b"IHDR" and len(head) >= 24:
         width, height = struct.unpack_from(">II", head, 16)
-        header = Header(width, height, complete=PNG_END in tail or PNG_END in read_all())
+        header = Header(width, height, is_complete=PNG_END in tail or PNG_END in read_all())
     elif head.startswith(JPEG):
         header = _parse_jpeg_header(head, tail, read_all)
     return header if header and header.width and header.height else None
@@ -55,7 +55,7 @@ def parse_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Hea
 def is_truncated(data: bytes) -> bool:
     """Return whether the end of a PNG or JPEG file is missing; False for other formats."""
     header = parse_header(data, data[-TAIL_SIZE:], lambda: data)
-    return header is not None and not header.complete
+    return header is not None and not header.is_complete
 
 
 def _parse_jpeg_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) -> Header | None:
@@ -65,15 +65,15 @@ def _parse_jpeg_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) 
         if marker in FRAME_MARKERS:
             height, width = struct.unpack_from(">HH", head, offset + 5)
             # Pixels cannot contain an end marker; a thumbnail has one, but before the frame header.
-            complete = JPEG_END in tail or read_all().find(JPEG_END, offset) >= 0
-            return Header(width, height, orientation, complete)
+            is_complete = JPEG_END in tail or read_all().find(JPEG_END, offset) >= 0
+            return Header(width, height, orientation, is_complete)
         if _is_exif(head, marker, offset):
             orientation = _read_orientation(head[offset + 10 : offset + 2 + length])
     return None
 
 
 def find_exif_segment(head: bytes) -> tuple[int, int] | None:
-    """Return the offset and length of the Exif segment in the first bytes of a JPEG file.
+    """Return the offset and length of the EXIF segment in the first bytes of a JPEG file.
 
     The TIFF block of the segment starts 10 bytes after the offset.  None if there is no such segment.
     """
@@ -111,14 +111,14 @@ def find_orientation(exif: bytes) -> int | None:
     if order is None or len(exif) < 8:
         return None
     (start,) = struct.unpack_from(order + "I", exif, 4)
-    entries = struct.unpack_from(order + "H", exif, start)[0] if start + 2 <= len(exif) else 0
-    for offset in range(start + 2, min(start + 2 + 12 * entries, len(exif) - 11), 12):
+    entry_count = struct.unpack_from(order + "H", exif, start)[0] if start + 2 <= len(exif) else 0
+    for offset in range(start + 2, min(start + 2 + 12 * entry_count, len(exif) - 11), 12):
         if struct.unpack_from(order + "H", exif, offset)[0] == ORIENTATION:
             return offset + 8
     return None
 
 
-# PNG files are checked and stripped before OpenCV reads them.
+# Check PNG files and strip their metadata before OpenCV reads them.
 
 # Chunks to keep in addition to the critical ones, whose names start with a capital letter.
 RELEVANT_CHUNKS = {b"tRNS", b"eXIf", b"acTL", b"fcTL", b"fdAT"}
@@ -206,8 +206,8 @@ def read_gray(path: Path, long_side: int) -> tuple[NDArray[np.uint8], tuple[floa
     """
     data = read_file(path, "an image", limit=MAX_BYTES)
     header = parse_header(data[:HEAD_SIZE], data[-TAIL_SIZE:], lambda: data) if data.startswith(JPEG) else None
-    longest = max(header.width, header.height) if header else 0
-    divisor = next((n for n in (8, 4, 2) if longest >= n * long_side), 1)
+    source_side = max(header.width, header.height) if header else 0
+    divisor = next((n for n in (8, 4, 2) if source_side >= n * long_side), 1)
     pixels = _decode(data, path, GRAY_FLAGS[divisor] | cv2.IMREAD_IGNORE_ORIENTATION)
     height, width = pixels.shape[:2]
     factor = max(1.0, max(height, width) / long_side)
@@ -235,9 +235,9 @@ def _transparent_gray(data: bytes) -> int | None:
     if data[:8] != PNG or len(data) < 26 or data[25] != 0:
         return None
     offset = data.find(b"\0\0\0\2tRNS", 33, data.find(b"IDAT"))
-    largest = (1 << data[24]) - 1
-    level = struct.unpack_from(">H", data, offset + 8)[0] & largest if offset > 0 else None
-    return None if level is None else level * max(1, 255 // largest)
+    max_level = (1 << data[24]) - 1
+    level = struct.unpack_from(">H", data, offset + 8)[0] & max_level if offset > 0 else None
+    return None if level is None else level * max(1, 255 // max_level)
 
 
 def _reset_orientation(data: bytes) -> bytes:
@@ -376,8 +376,8 @@ def _read_ifd(block: bytes, order: str, start: int) -> dict[int, Value]:
     The value of an array is its first element; three rationals are degrees, minutes, and seconds, in degrees.
     """
     values: dict[int, Value] = {}
-    (entries,) = struct.unpack_from(order + "H", block, start)
-    for entry in range(start + 2, start + 2 + 12 * entries, 12):
+    (entry_count,) = struct.unpack_from(order + "H", block, start)
+    for entry in range(start + 2, start + 2 + 12 * entry_count, 12):
         tag, value_type, count, value = struct.unpack_from(order + "HHII", block, entry)
         if value_type == RATIONAL:
             numbers = struct.unpack_from(order + "II" * (3 if count == 3 else 1), block, value)
@@ -406,9 +406,9 @@ def write_exposures(folder: Path, exposures: Mapping[str, CameraExposure | None]
 
     Raises OutputError.
     """
-    table = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
-    if table:
-        write_text(folder / EXPOSURES_FILE, json.dumps(table, indent=1) + "\n")
+    document = {name: asdict(exposure) for name, exposure in exposures.items() if exposure}
+    if document:
+        write_text(folder / EXPOSURES_FILE, json.dumps(document, indent=1) + "\n")
 
 
 def read_exposures(folder: Path) -> dict[str, CameraExposure]:
@@ -419,12 +419,12 @@ def read_exposures(folder: Path) -> dict[str, CameraExposure]:
     path = folder / EXPOSURES_FILE
     if not path.is_file():
         return {}
-    data, expected = read_json(path, "exposures of images"), "expected {name: {seconds, aperture, iso}}: remove it"
+    data, hint = read_json(path, "exposures of images"), "expected {name: {seconds, aperture, iso}}: remove the file"
     if not isinstance(data, dict):
-        raise DataError(f"{path}: {expected}")
+        raise DataError(f"{path}: {hint}")
     exposures = {}
     for name, row in data.items():
         if not isinstance(row, dict) or not (exposure := make_exposure(*map(row.get, ("seconds", "aperture", "iso")))):
-            raise DataError(f"{path}: the exposure of one image is not three positive numbers; {expected}")
+            raise DataError(f"{path}: the exposure of {quote(name)} is not three positive numbers; {hint}")
         exposures[name] = exposure
     return exposures

@@ -46,7 +46,7 @@ class LlffReader(Reader):
 
     def list_parts(self, parts: Parts) -> None:
         super().list_parts(parts)
-        parts.on_disk = image_files(parts.path)
+        parts.disk_files = image_files(parts.path)
 
 
 def read_poses(path: Path) -> NDArray[np.float64]:
@@ -71,8 +71,8 @@ def image_files(path: Path) -> list[Path]:
 
     The first of these folders that contains images is used; the list is empty if there is none.
     """
-    downscaled = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
-    for folder in (path / "images", path / "input", *sorted(downscaled, key=lambda folder: int(folder.name[7:])), path):
+    small_folders = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
+    for folder in (path / "images", path / "input", *sorted(small_folders, key=lambda f: int(f.name[7:])), path):
         files = sorted(file for file in folder.iterdir() if is_image(file)) if folder.is_dir() else []
         if files:
             return files

@@ -55,19 +55,19 @@ def _is_safe(name: str) -> bool:
 def require_files(path: Path, files: Iterable[Path]) -> None:
     """Raise DataError when some `files` of the dataset at `path` do not exist; the error names the first three."""
     paths = list(files)
-    if missing := [str(file) for file in paths if not os.path.exists(file)]:  # unlike Path.exists, never raises
-        raise DataError(f"{path}: {_describe_missing(missing, len(paths))}; restore them")
+    if missing_files := [str(file) for file in paths if not os.path.exists(file)]:  # unlike Path.exists, never raises
+        raise DataError(f"{path}: {_describe_missing(missing_files, len(paths))}; restore them")
 
 
-def _describe_missing(missing: Sequence[str], count: int) -> str:
-    names = ", ".join(map(shorten, missing[:3])) + (", ..." if len(missing) > 3 else "")
-    return f"{len(missing)} of {count} image files are missing: {names}"
+def _describe_missing(files: Sequence[str], total: int) -> str:
+    names = ", ".join(map(shorten, files[:3])) + (", ..." if len(files) > 3 else "")
+    return f"{len(files)} of {total} image files are missing: {names}"
 
 
 def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
     """Yield `path` and the folders up to `depth` levels below it, with the names of their files, both sorted.
 
-    Hidden folders, links, and folders of results are skipped.
+    Hidden folders, symbolic links, and folders of results are skipped.
     """
     for base, folders, files in os.walk(path):
         folder = Path(base)
@@ -79,7 +79,7 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
         yield folder, sorted(files)
 
 
-def unread_cameras(path: Path) -> str:
+def unsupported_cameras(path: Path) -> str:
     """Return a sentence about an unsupported camera file of another program at or below `path`, or "" without one."""
     folders = [(path.parent, [path.name])] if path.is_file() else walk_folders(path, 2)
     for folder, names in folders:
@@ -89,8 +89,8 @@ def unread_cameras(path: Path) -> str:
                 for program, pattern in OTHER_PROGRAMS.items():
                     if re.search(pattern, start):
                         return (
-                            f"the cameras of {program} in {file} are not read; to use them, export COLMAP's format, or "
-                            "convert them with `ns-process-data` of nerfstudio"
+                            f"the cameras of {program} in {file} are not supported; export them in COLMAP's format, or "
+                            "convert them with nerfstudio's `ns-process-data`"
                         )
     return ""
 
@@ -100,11 +100,11 @@ class FileLookup:
 
     The file `folder / name` is used if it exists.  Otherwise, a name and a file below `root` match if each is the only
     best match of the other; the best match has the longest common end of the path.  Case, the kind of slash, Unicode
-    normalization, URL escapes and the suffix of the image are ignored, and so are links that point out of `root`.
+    normalization, URL escapes and the image suffix are ignored, and so are symbolic links that point out of `root`.
 
-    spellings: returns the file names to try first for a name, by default the name itself.  strict: require that the
-    entire path matches, below the folder of the files or that of the name, as for masks and depth maps.  excluded:
-    files that must not match.
+    spellings: returns the file names to try first for a name, by default the name itself.  strict: require that
+    the entire relative path of the file or of the name matches, as for masks and depth maps.  excluded: files that must
+    not match.
     """
 
     def __init__(
@@ -117,11 +117,11 @@ class FileLookup:
         excluded: Iterable[Path] = (),
     ) -> None:
         self.root, self.folder, self.strict = root, folder, strict
-        self.listing, self.names = list(names), list(names)  # the names in the dataset, and those of the views
+        self.raw_names, self.names = list(names), list(names)  # as in the dataset, and of the views
         self.paths = [folder / ELSEWHERE / re.sub("[\0-\x1f]", "?", PureWindowsPath(name).name) for name in names]
         self.matches: dict[int, int] = {}  # length of the common end of the path, by index, of each inexact match
         self.downscaled_files: set[Path] = set()  # photographs from a folder such as images_4
-        self.choices: dict[int, list[Path]] = {}  # files that match a name equally well, by its index
+        self.candidates: dict[int, list[Path]] = {}  # files that match a name equally well, by its index
         unmatched = [i for i in range(len(names)) if not self._use_exact_match(i, spellings)]
         self._match(unmatched, {*excluded} | {*self.paths} - {self.paths[i] for i in unmatched})
         self.skipped = tuple(self.names[i] for i in unmatched if i not in self.matches)
@@ -130,12 +130,12 @@ class FileLookup:
 
     def _use_exact_match(self, i: int, spellings: Callable[[str], Sequence[str]]) -> bool:
         """Use the file that exactly matches the i-th name; return whether it exists."""
-        for name in filter(_is_safe, dict.fromkeys((self.listing[i], PureWindowsPath(self.listing[i]).as_posix()))):
+        for name in filter(_is_safe, dict.fromkeys((self.raw_names[i], PureWindowsPath(self.raw_names[i]).as_posix()))):
             for path in (self.folder / spelling for spelling in spellings(name)):
                 self.paths[i] = path
                 if os.path.exists(path):
                     self.names[i] = name
-                    if name != self.listing[i]:
+                    if name != self.raw_names[i]:
                         self.matches[i] = name.count("/") + 1
                     return True
         return False
@@ -164,24 +164,24 @@ class FileLookup:
         return files
 
     def _match(self, unmatched: Sequence[int], excluded: set[Path]) -> None:
-        targets = list(map(self._target, self.listing)) if unmatched else []
-        by_key = defaultdict[str, set[Parts]](set)
+        targets = list(map(self._target, self.raw_names)) if unmatched else []
+        targets_by_key = defaultdict[str, set[Parts]](set)
         for target in targets:
             for key in _keys(target):
-                by_key[key].add(target)
+                targets_by_key[key].add(target)
         for i in unmatched:
             candidates_by_rank = defaultdict[tuple[int, ...], list[tuple[Parts, Path]]](list)
             files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in excluded]
             siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
             for parts, path in siblings or files:
-                if rank := self._rank(self.listing[i], targets[i], parts, path):
+                if rank := self._rank(self.raw_names[i], targets[i], parts, path):
                     candidates_by_rank[rank].append((parts, path))
             best = candidates_by_rank[max(candidates_by_rank)] if candidates_by_rank else []
             if len(best) > 1:
-                self.choices[i] = [path for _, path in best]
+                self.candidates[i] = [path for _, path in best]
             for parts, path in best if len(best) == 1 else ():
                 length = _common_suffix(targets[i], parts)
-                other_targets = by_key[_stem(path.name)] - {targets[i]}
+                other_targets = targets_by_key[_stem(path.name)] - {targets[i]}
                 if all(_common_suffix(other_target, parts) < length for other_target in other_targets):
                     base = self.folder if path.is_relative_to(self.folder) else self.root
                     self.names[i], self.paths[i], self.matches[i] = path.relative_to(base).as_posix(), path, length
@@ -201,11 +201,11 @@ class FileLookup:
     def note(self) -> str:
         """One sentence with the number of inexact matches and how they match; "" if all matches are exact."""
         for i, length in self.matches.items():
-            count = f"{len(self.matches)} of {pluralize(len(self.listing), 'image' if self.strict else 'photo')}"
+            count = f"{len(self.matches)} of {pluralize(len(self.raw_names), 'image' if self.strict else 'photo')}"
             criterion = "base name" if length == 1 else "the end of their paths"
             scaling = ", with cameras scaled to these smaller photos" if self.downscaled_files else ""
             file = self.paths[i].relative_to(self.root).as_posix()
-            return f"{count} matched by {criterion}, such as {file} for {quote(self.listing[i])}{scaling}"
+            return f"{count} matched by {criterion}, such as {file} for {quote(self.raw_names[i])}{scaling}"
         return ""
 
     def existing_indices(self, source: Path, missing: Missing) -> list[int]:
@@ -214,16 +214,16 @@ class FileLookup:
         source: the dataset, for messages.  Raises DataError when all files are missing, or when some are and `missing`
         is "refuse".
         """
-        rows = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
-        if missing_indices := sorted({*range(len(self.paths))}.difference(rows), key=self.names.__getitem__):
+        indices = [i for i, path in enumerate(self.paths) if os.path.exists(path)]
+        if missing_indices := sorted({*range(len(self.paths))}.difference(indices), key=self.names.__getitem__):
             fault = f"{source}: {_describe_missing([str(self.paths[i]) for i in missing_indices], len(self.paths))}"
-            for name in [self.listing[i] for i in missing_indices if not _is_safe(self.listing[i])][:1]:
+            for name in [self.raw_names[i] for i in missing_indices if not _is_safe(self.raw_names[i])][:1]:
                 fault += f"; {quote(name)} is not a path below {self.folder}"
-            if missing == "refuse" or not rows:
-                skip_advice = ", or --set scene.missing=skip to train without them" if rows and not self.strict else ""
-                raise DataError(f"{fault}{self.hint}; restore them{skip_advice}")
+            if missing == "refuse" or not indices:
+                advice = ", or --set scene.missing=skip to train without them" if indices and not self.strict else ""
+                raise DataError(f"{fault}{self.hint}; restore them{advice}")
             logger.warning("%s%s; the scene is read without them", fault, self.hint)
-        return rows
+        return indices
 
     @cached_property
     def hint(self) -> str:
@@ -231,11 +231,11 @@ class FileLookup:
         if not self.skipped:
             return ""
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
-        for i, choices in self.choices.items():
-            matching_files = [relative[path].as_posix() for path in choices]
-            return f" ({first_few(matching_files)} fit {quote(self.listing[i])} equally well)"
+        for i, paths in self.candidates.items():
+            matching_files = [relative[path].as_posix() for path in paths]
+            return f" ({first_few(matching_files)} fit {quote(self.raw_names[i])} equally well)"
         if not relative:
-            return " (no images in that folder)"
+            return f" ({self.root} contains no images)"
         used_paths = {*self.paths}
         unused_names = {_stem(path.name): name for path, name in relative.items() if path not in used_paths}
         similar_stems = difflib.get_close_matches(_stem(self.skipped[0]), [*unused_names][:MAX_COMPARED], 1)

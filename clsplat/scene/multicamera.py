@@ -33,7 +33,7 @@ class MulticameraReader(Reader):
     expects = f"{VIDEOS}/ next to sparse/0 or {TRANSFORMS}"
 
     def matches(self, path: Path) -> bool:
-        """Return whether an entry of `videos` has the name of a camera.  Otherwise, it may be the source of a scene."""
+        """Return whether an entry of `videos` has the name of a camera.  Other scenes may keep source videos there."""
         names = {entry.name if entry.is_dir() else entry.stem for entry in _entries(path)}
         return bool(names) and not names.isdisjoint(_camera_names(path))
 
@@ -79,13 +79,13 @@ def _camera_names(path: Path) -> set[str]:
 
 def _frames(path: Path) -> dict[str, list[Path]]:
     """Return the sorted frames of each camera.  Raises DataError unless all have the same number, at least 2."""
-    folders = _entries(path)
+    entries = _entries(path)
     frames = {
-        entry.name: sorted(filter(is_image, entry.iterdir()), key=_natural_order) for entry in folders if entry.is_dir()
+        entry.name: sorted(filter(is_image, entry.iterdir()), key=_natural_order) for entry in entries if entry.is_dir()
     }
-    empty = [name for name, files in frames.items() if not files]
+    empty_names = [name for name, files in frames.items() if not files]
     frames = {name: files for name, files in frames.items() if files}
-    videos = [entry for entry in folders if entry.suffix.lower() in VIDEO_SUFFIXES and entry.stem not in frames]
+    videos = [entry for entry in entries if entry.suffix.lower() in VIDEO_SUFFIXES and entry.stem not in frames]
     if videos:
         folder = videos[0].with_suffix("")
         raise DataError(
@@ -94,10 +94,10 @@ def _frames(path: Path) -> dict[str, list[Path]]:
         )
     if not frames:
         raise DataError(f"{path / VIDEOS}: has no folders of frames; expected {VIDEOS}/NAME/0000.png … for each camera")
-    if empty:
+    if empty_names:
         raise DataError(
-            f"{path / VIDEOS}: {len(empty)} of {len(folders)} cameras have no frames: {first_few(empty)}; expected "
-            "images in each folder: add them, or remove the folder"
+            f"{path / VIDEOS}: {len(empty_names)} of {len(entries)} cameras have no frames: {first_few(empty_names)}; "
+            "expected images in each folder: add them, or remove the folder"
         )
     counts = {name: len(files) for name, files in frames.items()}
     short, long = (select(counts, key=counts.__getitem__) for select in (min, max))
@@ -120,8 +120,8 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
     """Return a view for each camera with frames, and the points.  Raises DataError for a camera without a pose."""
     if (path / TRANSFORMS).is_file():
         transforms = Transforms(path / TRANSFORMS)
-        first = next(iter(frames.values()))[0]
-        size = stored_size(first)
+        first_frame = next(iter(frames.values()))[0]
+        size = stored_size(first_frame)
         views = [make_view(frame, frame.image_name(), size) for frame in transforms.frames]
         points = transforms.points(Clock(0.0, 1.0))
     else:

@@ -28,7 +28,7 @@ def load_photograph(
     """
     if view.lens is None or undistorted is None or view.image is not None:
         return _load(view, background)
-    file = undistorted / f"{view.name}.{_key(view, background)}.png"
+    file = undistorted / f"{view.name}.{_cache_key(view, background)}.png"
     try:
         return read_image(file).astype(np.uint8)
     except DataError:
@@ -37,7 +37,7 @@ def load_photograph(
     return pixels
 
 
-def _key(view: View, background: tuple[float, float, float]) -> str:
+def _cache_key(view: View, background: tuple[float, float, float]) -> str:
     """Return a hash of everything that the cached photograph depends on: file, lens, size, mask and background."""
     state = view.image_path.stat() if view.image_path.exists() else None
     file_stamp = state and (state.st_mtime_ns, state.st_size)
@@ -80,32 +80,32 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
     masks = find_masks(folder, photographs)
     views = tuple(replace(view, mask_path=mask) for view, mask in zip(scene.views, masks, strict=True))
     masks_by_name = dict(zip(photographs, masks, strict=True))
-    count, missing = len(masks_by_name), [name for name, mask in masks_by_name.items() if mask is None]
-    if len(missing) == count:
+    count, missing_names = len(masks_by_name), [name for name, mask in masks_by_name.items() if mask is None]
+    if len(missing_names) == count:
         fault = f"contains no mask for the photos of {scene.path}" if folder.is_dir() else "no such folder"
-        names = " or ".join(str(folder / file) for file in reversed(_mask_names(missing[0])))
+        names = " or ".join(str(folder / file) for file in reversed(_mask_names(missing_names[0])))
         raise DataError(
-            f"{folder}: {fault}; expected {names} for the first of {count}, with usable pixels "
-            "white: rename the files, or set scene.masks to another folder"
+            f"{folder}: {fault}; expected {names} for the first of {count} photos, "
+            "with white for usable pixels: rename the files, or set scene.masks to another folder"
         )
-    if missing:
-        masked = f"{count - len(missing)} of {pluralize(count, 'photo')}"
+    if missing_names:
+        photos = f"{count - len(missing_names)} of {pluralize(count, 'photo')}"
         LOG.warning(
-            "%s: contains masks for %s; all pixels of the others are used, such as %s", folder, masked, missing[0]
+            "%s: contains masks for %s; all pixels of %s and the others are used", folder, photos, missing_names[0]
         )
     return _without_hidden_faces(replace(scene, views=views))
 
 
 def _without_hidden_faces(scene: Scene) -> Scene:
     read_mask = lru_cache(1)(read_image)
-    rows = [
+    visible = [
         i
         for i, (mask, lens) in enumerate((view.mask_path, view.lens) for view in scene.views)
         if mask is None or lens is None or not lens.face or lens.shows_white(read_mask(mask))
     ]
-    new_indices = {old: i for i, old in enumerate(rows)}
-    train, test, validation = (tuple(new_indices[i] for i in old if i in new_indices) for old in scene.indices.values())
-    views = tuple(scene.views[i] for i in rows)
+    new_index = {old: i for i, old in enumerate(visible)}
+    train, test, validation = (tuple(new_index[i] for i in split if i in new_index) for split in scene.indices.values())
+    views = tuple(scene.views[i] for i in visible)
     return replace(scene, views=views, train=train, test=test, validation=validation)
 
 

@@ -32,18 +32,18 @@ class Surface:
 
     view: View
     image: Floats  # [H, W, 3] float32, in [0, 1]
-    inverse: Floats  # [H, W] 1 / depth, 1 / scene units; 0 where unknown
+    inverse_depths: Floats  # [H, W], 1 / scene units; 0 where unknown
     step: float  # difference of inverse depth between planes, 1 / scene units
 
     def is_new(self, points: Floats) -> NDArray[np.bool_]:
         """Return a mask, [H, W], of the pixels with a surface that none of the points, [M, 3], covers or hides.
 
-        A point covers the pixel that it projects to, unless the surface in that pixel is more than a plane nearer.
+        A point covers the pixel that it projects to, unless the surface in that pixel is more than one plane nearer.
         """
         is_visible, row, column, depth = _project(self.view, points)
-        nearest = np.zeros(self.inverse.shape)
+        nearest = np.zeros(self.inverse_depths.shape)
         np.maximum.at(nearest, (row[is_visible], column[is_visible]), 1 / depth[is_visible])
-        return np.asarray((nearest == 0) | (self.inverse > nearest + self.step))
+        return np.asarray((nearest == 0) | (self.inverse_depths > nearest + self.step))
 
 
 def sweep_points(
@@ -52,70 +52,70 @@ def sweep_points(
     load: Callable[[View], NDArray[np.uint8]],
     count: int,
     seed: int,
-    existing: Floats | None = None,
-    allowed: Callable[[View], NDArray[np.bool_] | None] = lambda view: None,
+    points: Floats | None = None,
+    load_mask: Callable[[View], NDArray[np.bool_] | None] = lambda view: None,
 ) -> PointCloud:
     """Return at most `count` colored points on the surfaces that adjacent views agree on; there may be none.
 
-    center: the point that the cameras look at, [3].  load: returns the photograph of a view, [H, W, 3].  existing:
-    points, [M, 3]; the pixels that show them are skipped.  allowed: returns which pixels of a view may become points,
-    [H, W], or None for all.
+    center: the point that the cameras look at, [3].  load: returns the photograph of a view, [H, W, 3].  points:
+    existing points, [M, 3]; the pixels that show them are skipped.  load_mask: returns a mask, [H, W], of the pixels of
+    a view that may become points, or None for all.
     """
     positions, colors = [], []
-    for surface in surfaces(views, center, load):
-        view, image, mask = surface.view, surface.image, surface.inverse > 0
-        if (usable := allowed(view)) is not None:
-            mask &= usable
-        if existing is not None:
-            mask &= surface.is_new(existing)
+    for surface in find_surfaces(views, center, load):
+        view, image, mask = surface.view, surface.image, surface.inverse_depths > 0
+        if (view_mask := load_mask(view)) is not None:
+            mask &= view_mask
+        if points is not None:
+            mask &= surface.is_new(points)
         rows, columns = np.nonzero(mask)
-        positions.append(_unproject(view, rows, columns, 1 / surface.inverse[mask]))
+        positions.append(_unproject(view, rows, columns, 1 / surface.inverse_depths[mask]))
         colors.append(image[mask])
     all_positions, all_colors = np.concatenate(positions), np.concatenate(colors)
     sampled_rows = np.sort(np.random.default_rng([seed, count]).permutation(len(all_positions))[:count])
     return PointCloud(all_positions[sampled_rows].astype(np.float32), all_colors[sampled_rows])
 
 
-def surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
+def find_surfaces(views: Sequence[View], center: Floats, load: Callable[[View], NDArray[np.uint8]]) -> list[Surface]:
     """Return the surface in each view; the arguments are those of `sweep_points`."""
-    small = [
+    views = [
         view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
         for view in views
     ]
-    images = [load(view).astype(np.float32) / 255 for view in small]
-    nearest = [_neighbors(i, small) for i in range(len(small))]
-    distance = float(np.median([np.linalg.norm(view.position - center) for view in small]))
-    inverse = np.linspace(1 / (MAX_DEPTH * distance), 1 / (MIN_DEPTH * distance), PLANES)
-    planes = [_best_planes(i, small, images, nearest[i], inverse) for i in range(len(small))]
-    step = float(inverse[1] - inverse[0])
+    images = [load(view).astype(np.float32) / 255 for view in views]
+    neighbors = [_neighbors(i, views) for i in range(len(views))]
+    distance = float(np.median([np.linalg.norm(view.position - center) for view in views]))
+    inverse_depths = np.linspace(1 / (MAX_DEPTH * distance), 1 / (MIN_DEPTH * distance), PLANES)
+    planes = [_best_planes(i, views, images, neighbors[i], inverse_depths) for i in range(len(views))]
+    masks = [_confirm(i, views, planes, neighbors[i], inverse_depths) for i in range(len(views))]
+    step = float(inverse_depths[1] - inverse_depths[0])
     return [
-        Surface(view, images[i], np.where(_confirm(i, small, planes, nearest[i], inverse), inverse[planes[i]], 0), step)
-        for i, view in enumerate(small)
+        Surface(view, images[i], np.where(masks[i], inverse_depths[planes[i]], 0), step) for i, view in enumerate(views)
     ]
 
 
 def _neighbors(i: int, views: Sequence[View]) -> list[int]:
-    """Return the indices of the views nearest to view i whose viewing directions differ from its by at most 60°."""
+    """Return the indices of the NEIGHBORS nearest views of view i that look within 60° of its direction."""
     position, direction = views[i].position, views[i].world_to_camera[2, :3]
     similar_views = [j for j, view in enumerate(views) if j != i and view.world_to_camera[2, :3] @ direction > 0.5]
     return sorted(similar_views, key=lambda j: float(np.linalg.norm(views[j].position - position)))[:NEIGHBORS]
 
 
 def _best_planes(
-    i: int, views: Sequence[View], images: Sequence[Floats], neighbors: Sequence[int], inverse: Floats
+    i: int, views: Sequence[View], images: Sequence[Floats], neighbors: Sequence[int], inverse_depths: Floats
 ) -> NDArray[np.int64]:
-    """Return the index of each pixel's best plane, [H, W], judged by the better half of the adjacent views.
+    """Return the index of each pixel's best plane, [H, W].
 
     The best plane has the lowest cost.  The cost is the mean color difference to the better half of the adjacent views
     (rounded up), since the others may not show the surface.  The index is 0 where no plane is clearly the best: in
     uniform areas, and where no adjacent view shows the surface.
     """
     view, image = views[i], images[i]
-    costs = np.empty((len(inverse), *image.shape[:2]), np.float32)
-    for plane, depth in enumerate(inverse):
+    costs = np.empty((len(inverse_depths), *image.shape[:2]), np.float32)
+    for plane, inverse_depth in enumerate(inverse_depths):
         differences = []
         for j in neighbors:
-            matrix = _homography(view, views[j], depth)
+            matrix = _homography(view, views[j], inverse_depth)
             size = view.camera.width, view.camera.height
             warped_image = cv2.warpPerspective(
                 images[j], matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderValue=(9, 9, 9)
@@ -155,25 +155,25 @@ def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Indices, In
     """
     camera, pose = view.camera, view.world_to_camera
     x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
-    in_front = z > 0
-    depth = np.where(in_front, z, 1)
+    is_in_front = z > 0
+    depth = np.where(is_in_front, z, 1)
     column = np.floor(x / depth * camera.fx + camera.cx).clip(-1, camera.width).astype(int)
     row = np.floor(y / depth * camera.fy + camera.cy).clip(-1, camera.height).astype(int)
-    is_visible = in_front & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    is_visible = is_in_front & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
     return is_visible, row, column, depth
 
 
 def _confirm(
-    i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], neighbors: Sequence[int], inverse: Floats
+    i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], neighbors: Sequence[int], inverse_depths: Floats
 ) -> NDArray[np.bool_]:
-    """Return a mask, [H, W], of the pixels whose depth enough adjacent views confirm and is not on an outer plane."""
+    """Return a mask, [H, W], of the pixels whose depth enough adjacent views confirm, except on the outer planes."""
     shape = planes[i].shape
     rows, columns = (index.ravel() for index in np.indices(shape))
-    points = _unproject(views[i], rows, columns, 1 / inverse[planes[i].ravel()])
+    points = _unproject(views[i], rows, columns, 1 / inverse_depths[planes[i].ravel()])
     votes = np.zeros(len(points), int)
     for j in neighbors:
         is_visible, row, column, depth = _project(views[j], points)
-        inverse_depth = inverse[planes[j][row * is_visible, column * is_visible]]
-        votes += is_visible & (np.abs(inverse_depth - 1 / depth) < MAX_DIFFERENCE * (inverse[1] - inverse[0]))
-    is_inner = (planes[i] > 0) & (planes[i] < len(inverse) - 1)
+        surface = inverse_depths[planes[j][row * is_visible, column * is_visible]]
+        votes += is_visible & (np.abs(surface - 1 / depth) < MAX_DIFFERENCE * (inverse_depths[1] - inverse_depths[0]))
+    is_inner = (planes[i] > 0) & (planes[i] < len(inverse_depths) - 1)
     return np.asarray((votes >= MIN_VOTES).reshape(shape) & is_inner)

@@ -38,8 +38,8 @@ class PointTable(NamedTuple):
 
     def is_finite(self) -> NDArray[np.bool_]:
         """Return which points are finite, [M]."""
-        finite = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
-        return np.asarray(finite & (np.abs(self.times) < MAX_VALUE) if len(self.times) else finite)
+        is_finite = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
+        return np.asarray(is_finite & (np.abs(self.times) < MAX_VALUE) if len(self.times) else is_finite)
 
     def cloud(self, clock: Clock | None = None) -> PointCloud:
         """Return the finite points, and log how many points are dropped.
@@ -47,13 +47,13 @@ class PointTable(NamedTuple):
         clock: the clock of the frames.  Without it, the points have no times.  Raises DataError for times in another
         unit.
         """
-        finite, times = self.is_finite(), None
-        if not finite.all():
-            logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~finite):,}")
-        colors = np.asarray(self.rgb[finite], np.float32) / np.float32(255)
+        is_finite, times = self.is_finite(), None
+        if not is_finite.all():
+            logger.warning("%s: dropped %s points that are not finite", self.file, f"{np.count_nonzero(~is_finite):,}")
+        colors = np.asarray(self.rgb[is_finite], np.float32) / np.float32(255)
         if clock and len(self.times):
-            times = np.asarray(clock.normalize_points(self.file, self.times[finite]), np.float32)
-        return PointCloud(self.positions[finite], colors, times)
+            times = np.asarray(clock.normalize_points(self.file, self.times[is_finite]), np.float32)
+        return PointCloud(self.positions[is_finite], colors, times)
 
 
 def read_points_ply(path: Path, clock: Clock | None = None) -> PointCloud:
@@ -73,7 +73,7 @@ def read_ply_table(path: Path) -> PointTable:
         raise DataError(f"{path}: is big-endian; expected ascii or binary_little_endian: export it again")
     names = header.dtype.names or ()
     if not set(POINT.names or ()) <= set(names) or any(header.dtype[name] != np.uint8 for name in RGB):
-        raise DataError(f"{path}: expected x y z and uchar red green blue of each vertex, found {quote(names)}")
+        raise DataError(f"{path}: expected vertices with x y z and uchar red green blue, found {quote(names)}")
     if header.format == "ascii":
         table = read_ascii(path, data, header)
     else:
@@ -86,10 +86,10 @@ def read_ply_table(path: Path) -> PointTable:
 
 def write_points_ply(path: Path, points: PointCloud) -> None:
     """Write points, including their times if they have any, as binary little-endian PLY.  Raises OutputError."""
-    kind = POINT if points.times is None else TIMED_POINT
+    dtype = POINT if points.times is None else TIMED_POINT
     if points.positions.dtype == np.float64:  # world coordinates, for which float32 may be too coarse
-        kind = np.dtype([(name, "<f8" if name in "xyz" else kind[name]) for name in kind.names or ()])
-    table = np.empty(len(points), kind)
+        dtype = np.dtype([(name, "<f8" if name in "xyz" else dtype[name]) for name in dtype.names or ()])
+    table = np.empty(len(points), dtype)
     if points.times is not None:
         table[TIME] = points.times
     for i, name in enumerate("xyz"):
@@ -97,6 +97,6 @@ def write_points_ply(path: Path, points: PointCloud) -> None:
     for i, name in enumerate(RGB):
         table[name] = np.rint(points.colors[:, i] * 255)
     ply_types = {"|u1": "uchar", "<f4": "float", "<f8": "double"}
-    properties = [f"{ply_types[kind[name].str]} {name}" for name in kind.names or ()]
+    properties = [f"{ply_types[dtype[name].str]} {name}" for name in dtype.names or ()]
     with open_atomic(path) as file:
         file.write(format_ply_header((), vertex=(len(points), properties)) + table.tobytes())

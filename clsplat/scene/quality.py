@@ -13,7 +13,7 @@ from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import MIN_WHITE, View, load_mask, load_transparency, sample_views
 
-NEAREST = 0.01  # quantile of the depths of observed points, since the nearest few points are usually wrong
+NEAR_QUANTILE = 0.01  # of the depths of observed points, since the nearest few points are usually wrong
 NEAR_FRACTION = 0.04  # of the extent
 MAX_POINTS = 10_000  # of a cloud, used to estimate depths
 
@@ -46,7 +46,7 @@ def near_depth(scene: Scene) -> float | None:
     views = scene.merge_validation().split("train")
     with np.errstate(all="ignore"):  # points of a damaged file
         visible_depths = [depths[depths < np.inf] for depths in (_observed_depths(scene, view) for view in views)]
-    return float(np.quantile(np.concatenate(visible_depths), NEAREST)) if any(map(len, visible_depths)) else None
+    return float(np.quantile(np.concatenate(visible_depths), NEAR_QUANTILE)) if any(map(len, visible_depths)) else None
 
 
 def _observed_depths(scene: Scene, view: View) -> NDArray[np.floating]:
@@ -81,7 +81,7 @@ def near_plane(scene: Scene) -> float:
 
 # Sharpness of photographs.
 
-BLURRED = 0.25  # of the median of a set: sharp photographs have at least 0.4, those with a blur of 1 px 0.05 to 0.09
+MIN_SHARPNESS = 0.25  # of the median of a set: sharp photographs reach 0.4 or more, a blur of 1 px only 0.05 to 0.09
 SIDE = 480  # px: sharpness is measured at this size, since noise looks like detail at full size
 
 
@@ -109,7 +109,7 @@ def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool
 
     The first value is also small for a dark photograph, the second for a bright photograph among dark ones.
     """
-    return bool((values < BLURRED * median).all())
+    return bool((values < MIN_SHARPNESS * median).all())
 
 
 # Blank photographs, and masks that exclude everything.

@@ -32,11 +32,11 @@ class Parts:
     observed: dict[str, int] = field(default_factory=dict)  # number of points that each view observes, if known
     submodels: dict[str, int] = field(default_factory=dict)  # image counts of COLMAP models, the one in use first
     points: PointTable | None = None
-    image_folder: Path | None = None  # contains all images; None: those in `expected`
-    on_disk: list[Path] = field(default_factory=list)  # image files in the folders of the views
-    expected: list[Path] = field(default_factory=list)  # files that the dataset names
+    image_folder: Path | None = None  # contains all images; None: those in `expected_files`
+    disk_files: list[Path] = field(default_factory=list)  # image files in the folders of the views
+    expected_files: list[Path] = field(default_factory=list)  # files that the dataset names
     faults: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)  # warnings about files that `prepare` cannot read
+    warnings: list[str] = field(default_factory=list)  # about files that `prepare` cannot read
     hint: str = ""  # about existing files that are similar to missing ones
     notes: list[str] = field(default_factory=list)  # about files that are not at the paths in the dataset
     scene: Scene | None = None
@@ -53,7 +53,7 @@ class Parts:
 
     def expect(self, files: FileLookup) -> None:
         """Add the files that the dataset refers to, with a note about inexact matches."""
-        self.expected += files.paths
+        self.expected_files += files.paths
         self.notes += [files.note] if files.note else []
         self.hint = files.hint
         if not all(path.is_relative_to(files.folder) for path in files.paths):
@@ -78,13 +78,13 @@ class Reader(ABC):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         name = (cls.__module__, cls.__qualname__)
-        cls.subclasses[:] = [kind for kind in cls.subclasses if (kind.__module__, kind.__qualname__) != name] + [cls]
+        cls.subclasses[:] = [c for c in cls.subclasses if (c.__module__, c.__qualname__) != name] + [cls]
 
     def __init__(self) -> None:
         missing_attributes = [field for field in ("name", "expects") if not hasattr(self, field)]
         if missing_attributes:
-            kind = f"{type(self).__module__}.{type(self).__name__}"
-            raise ConfigError(f"the reader {kind} has no {' and no '.join(missing_attributes)}; add it to the class")
+            name = f"{type(self).__module__}.{type(self).__name__}"
+            raise ConfigError(f"the reader {name} has no {' and no '.join(missing_attributes)}; add it to the class")
 
     @property
     def note(self) -> str:
@@ -109,7 +109,7 @@ class Reader(ABC):
         scene = parts.scene
         if scene is not None:
             parts.views = list(scene.views)
-            parts.expected = [view.image_path for view in scene.views]
+            parts.expected_files = [view.image_path for view in scene.views]
         if scene is not None and scene.points is not None:
             rgb = np.rint(scene.points.colors * 255)
             parts.points = PointTable(parts.path, scene.points.positions, rgb)
@@ -117,5 +117,5 @@ class Reader(ABC):
 
 def reader_classes() -> list[type[Reader]]:
     """Return the reader classes that are not abstract and have no subclasses, in the order of their definition."""
-    bases = {base for kind in Reader.subclasses for base in kind.__mro__[1:]}
-    return [kind for kind in Reader.subclasses if kind not in bases and not inspect.isabstract(kind)]
+    bases = {base for cls in Reader.subclasses for base in cls.__mro__[1:]}
+    return [cls for cls in Reader.subclasses if cls not in bases and not inspect.isabstract(cls)]

@@ -15,22 +15,22 @@ MAX_ERROR = 1.0  # px at the training resolution (our choice): beyond it, the pi
 EXACT = 1e-3  # px: below it, observations were computed from the cameras and say nothing about them
 
 
-def reprojection_residuals(view: View, positions: NDArray[np.floating], observed: Floats) -> Floats:
-    """Return the vectors, [K, 2] px, from the projections of `positions`, [K, 3], to the pixels `observed`, [K, 2].
+def reprojection_residuals(view: View, positions: NDArray[np.floating], observations: Floats) -> Floats:
+    """Return the vectors, [K, 2], from the projections of `positions`, [K, 3], to their `observations`, [K, 2] px.
 
     Pixels are those of the original photograph.  The result is NaN for points behind the camera and for observations
     far outside of the photograph.
     """
     original = view.lens or view.camera
     size = np.array([original.width, original.height])
-    is_plausible = np.all(np.abs(observed - size / 2) <= size, axis=1, keepdims=True)  # others come from damaged files
-    return np.where(is_plausible, observed - project_points(view, positions), np.nan)
+    is_plausible = np.all(np.abs(observations - size / 2) <= size, axis=1, keepdims=True)  # others are damage
+    return np.where(is_plausible, observations - project_points(view, positions), np.nan)
 
 
 def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
     """Return the projections of positions, [K, 3], into the original photograph of a view, [K, 2] px.
 
-    Positions behind the camera have projections of NaN.
+    The result is NaN for positions behind the camera.
     """
     points = np.einsum("ij,nj->ni", view.world_to_camera[:, :3], positions) + view.world_to_camera[:, 3]
     points[~(points[:, 2] > 0)] = np.nan

@@ -172,14 +172,14 @@ class Scene:
             return self
         views: list[View] = []
         splits: dict[str, list[int]] = {name: [] for name in SPLITS}
-        smallest = min(self.downscales)
+        min_downscale = min(self.downscales)
         for downscale in downscales:
-            if downscale < smallest:
+            if downscale < min_downscale:
                 raise DataError(
-                    f"{self.path}: the largest images are downscaled by {smallest:g}, "
-                    f"more than by {downscale:g}; raise it to {smallest:g}"
+                    f"{self.path}: the largest images are already downscaled by {min_downscale:g}; "
+                    f"expected a downscale of at least {min_downscale:g}, got {downscale:g}"
                 )
-            source = downscale if downscale in self.downscales else smallest
+            source = downscale if downscale in self.downscales else min_downscale
             for name, indices in splits.items():
                 sources = [view for view in self.split(name) if view.downscale == source]
                 indices += range(len(views), len(views) + len(sources))
@@ -251,7 +251,7 @@ def make_scene(
     points = points if points and len(points) else None
     origin = choose_origin(views, points)
     if origin.any():
-        LOG.info("%s: coordinates are far from zero; the run uses %s as the origin", path, position_text(origin))
+        LOG.info("%s: coordinates are far from zero; the run uses %s as the origin", path, format_position(origin))
         views = [view.shifted(origin) for view in views]
         points = points and replace(points, positions=points.positions - origin)
     color = WHITE if background == "white" else BLACK
@@ -289,7 +289,7 @@ def far_origin(center: Floats, positions: Floats) -> Floats:
     return np.round(center / step) * step + 0.0  # no -0.0
 
 
-def position_text(position: Floats) -> str:
+def format_position(position: Floats) -> str:
     """Format a position, [3], with all its digits."""
     return f"({', '.join(f'{value:.15g}' for value in position)})"
 
@@ -298,16 +298,16 @@ def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = N
     """Return the radius of the cameras: 1.1 x the largest distance of a camera from their mean (Kerbl et al. 2023).
 
     Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.  If all cameras
-    have the same center, the result is the median distance of the points from it or, without points, its distance from
-    zero.
+    have the same center, the result is the median distance of the points from it or, without points, the depth of the
+    origin in the first view.
     """
     centers = np.stack([v.position for v in views])[~outlier_cameras(views)]
     center = centers.mean(axis=0)
     if not have_same_center(centers):
         return 1.1 * float(np.linalg.norm(centers - center, axis=1).max())
-    finite = np.zeros((0, 3)) if points is None else points.astype(np.float64)
-    finite = finite[np.isfinite(finite).all(axis=1)]
-    distances = np.linalg.norm(finite - center, axis=1) if len(finite) else np.abs([views[0].world_to_camera[2, 3]])
+    cloud = np.zeros((0, 3)) if points is None else points.astype(np.float64)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    distances = np.linalg.norm(cloud - center, axis=1) if len(cloud) else np.abs([views[0].world_to_camera[2, 3]])
     return float(np.median(distances)) or 1.0
 
 
@@ -319,7 +319,7 @@ def have_same_center(centers: Floats) -> bool:
 def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
     """Return a mask, [N], of the cameras farther than MAX_DISTANCE times the median distance from the median center.
 
-    If their fraction exceeds MAX_OUTLIERS, they are a separate group of cameras instead of outliers: the mask is empty.
+    If their fraction exceeds MAX_OUTLIERS, they are a separate group of cameras, and the mask is all False.
     """
     centers = np.stack([v.position for v in views])
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

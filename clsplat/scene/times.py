@@ -23,12 +23,12 @@ class Clock:
 
         Raises DataError if some are outside the range of the scene by more than a single-precision rounding error.
         """
-        span, largest = self.last - self.first, max(abs(self.first), abs(self.last))
-        slack = max(1e-3 * span, float(np.finfo(np.float32).eps) * largest)
+        span, max_time = self.last - self.first, max(abs(self.first), abs(self.last))
+        slack = max(1e-3 * span, float(np.finfo(np.float32).eps) * max_time)
         low, high = (float(values.min()), float(values.max())) if values.size else (self.first, self.last)
         if low < self.first - slack or high > self.last + slack:
             raise DataError(
-                f"{path}: its points have times from {low:.9g} to {high:.9g}, but the frames {self.first:.9g} to "
+                f"{path}: its points have times from {low:.9g} to {high:.9g}, but the frames from {self.first:.9g} to "
                 f"{self.last:.9g}; use the unit of the frames, or remove the property `time` of the points"
             )
         return self(values)
@@ -38,17 +38,17 @@ class Clock:
         return np.clip((np.asarray(values, np.float64) - self.first) / (self.last - self.first), 0, 1)
 
 
-def make_clock(path: object, moments: Sequence[tuple[str, float | None]]) -> Clock | None:
+def make_clock(path: object, timestamps: Sequence[tuple[str, float | None]]) -> Clock | None:
     """Return the clock of a dataset from the names and timestamps of its frames, or None without timestamps.
 
     Raises DataError when only some frames have a timestamp, or when all timestamps are equal.
     """
-    values = [value for _, value in moments if value is not None]
+    values = [value for _, value in timestamps if value is not None]
     if not values:
         return None
-    if names := [name for name, value in moments if value is None]:
+    if names := [name for name, value in timestamps if value is None]:
         raise DataError(
-            f"{path}: {len(names)} of {len(moments)} frames have no `time`: {first_few(names)}; "
+            f"{path}: {len(names)} of {len(timestamps)} frames have no `time`: {first_few(names)}; "
             "add the missing times, or remove all times for a static scene"
         )
     first, last = min(values), max(values)

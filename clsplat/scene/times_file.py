@@ -14,7 +14,7 @@ from clsplat.scene.times import make_clock
 from clsplat.scene.view import View
 
 FILE = "times.json"
-LARGEST = 1 << 26  # bytes
+MAX_BYTES = 1 << 26
 
 
 def write_times(folder: Path, times: Mapping[str, float]) -> None:
@@ -27,14 +27,14 @@ def read_times(folder: Path) -> dict[str, float] | None:
     path = folder / FILE
     if not os.path.lexists(path):  # reading reports a path that is not a file
         return None
-    table = read_json(path, "timestamps of photos in JSON", limit=LARGEST)
+    table = read_json(path, "timestamps of photos in JSON", limit=MAX_BYTES)
     if not isinstance(table, dict):
         raise DataError(f"{path}: expected a JSON object that maps the name of each photo to a number")
     for name, value in table.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
             raise DataError(
                 f"{path}: the time of {quote(name)} is {quote(value)}; expected {BELOW_MAX}: write all times in "
-                "another unit"
+                "a larger unit"
             )
     return {name: float(value) for name, value in table.items()}
 
@@ -49,5 +49,5 @@ def add_times(views: list[View], folder: Path) -> list[View]:
         return views
     clock = make_clock(folder / FILE, [(view.name, times.get(view.name)) for view in views])
     if clock is None:
-        raise DataError(f"{folder / FILE}: names none of the {len(views)} photos; write their relative paths")
+        raise DataError(f"{folder / FILE}: contains none of the {len(views)} photos; use their relative paths")
     return [replace(view, time=float(clock(times[view.name]))) for view in views]

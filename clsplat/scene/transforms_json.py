@@ -16,14 +16,14 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens, panorama_lens
 from clsplat.scene.images import stored_size
-from clsplat.scene.lookup import FileLookup, Missing, safe_join, unread_cameras
+from clsplat.scene.lookup import FileLookup, Missing, safe_join, unsupported_cameras
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.reader import Parts, Reader
 from clsplat.scene.scene import Background, PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock, make_clock
 from clsplat.scene.view import Floats, View, fit_to_photograph
 
-POINTS = "points3d.ply"
+POINTS_FILE = "points3d.ply"
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 LENSES = {  # the parameters of each camera_model, in COLMAP's order
     **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), DISTORTION[:4]),
@@ -31,25 +31,25 @@ LENSES = {  # the parameters of each camera_model, in COLMAP's order
     **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), ("k1", "k2", "k3", "k4")),
     "EQUIRECTANGULAR": (),
 }
-COLMAP = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
+COLMAP_MODELS = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
 MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one scene; reading takes about 15 s
 MIN_SCALE = 1e-6  # of the rotation in a pose
 MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
 
 
 class JsonFrame:
-    """The values of one image in a file; those at the top level of the file are defaults.
+    """The values of one image in a file; values at the top level of the file are defaults.
 
     source: the file and the index of the frame, for messages.
     """
 
-    def __init__(self, folder: Path, source: str, values: dict[str, Any], common: dict[str, Any] | None = None) -> None:
+    def __init__(self, folder: Path, source: str, values: dict[str, Any], shared: dict[str, Any] | None = None) -> None:
         self.folder, self.source = folder, source
-        self._values, self._common = values, common or {}
+        self._values, self._defaults = values, shared or {}
 
     def value(self, key: str) -> Any:
         """Return the unchecked value of a key, or None."""
-        return self._values[key] if key in self._values else self._common.get(key)
+        return self._values[key] if key in self._values else self._defaults.get(key)
 
     def array(self, key: str) -> Floats:
         """Return a list of numbers as an array of unchecked shape; any other value becomes an empty array."""
@@ -100,7 +100,7 @@ class Transforms:
             raise DataError(f"{path}: has {len(frames)} frames; expected at most {MAX_FRAMES}: split the scene")
         self.frames = [JsonFrame(path.parent, f"{path}: frames[{i}]", row, self.table) for i, row in enumerate(frames)]
 
-    def moments(self) -> list[tuple[str, float | None]]:
+    def timestamps(self) -> list[tuple[str, float | None]]:
         """Return the source of every frame and its `time`, or None without one.  Raises DataError for invalid times."""
         return [(frame.source, frame.number("time")) for frame in self.frames]
 
@@ -114,7 +114,7 @@ class Transforms:
         name = JsonFrame(self.path.parent, str(self.path), self.table).file_name("ply_file_path")
         if name is not None:
             return safe_join(self.path.parent, name, str(self.path))
-        default = self.path.parent / POINTS
+        default = self.path.parent / POINTS_FILE
         return default if default.is_file() else None
 
 
@@ -126,10 +126,10 @@ class FrameFiles(FileLookup):
         self.frames = frames
         self.masks: dict[str, dict[int, Path]] = {"mask_path": {}, "static_path": {}}  # by key and index of the frame
 
-    def find_masks(self, source: Path, rows: Sequence[int]) -> None:
-        """Find the masks of the frames with indices `rows`.  Raises DataError when a mask is missing."""
+    def find_masks(self, source: Path, indices: Sequence[int]) -> None:
+        """Find the masks of the frames with these indices.  Raises DataError when a mask is missing."""
         for key in self.masks:
-            names = {i: name for i in rows if (name := self.frames[i].file_name(key))}
+            names = {i: name for i in indices if (name := self.frames[i].file_name(key))}
             files = FileLookup(self.root, self.folder, [*names.values()], strict=True, excluded=self.paths)
             files.existing_indices(source, "refuse")
             self.masks[key] = dict(zip(names, files.paths, strict=True))
@@ -139,9 +139,9 @@ class FrameFiles(FileLookup):
 
         missing: how to handle missing photographs.  Raises DataError for invalid values and missing files.
         """
-        rows = self.existing_indices(source, missing)
-        self.find_masks(source, rows)
-        return [self.view(i, clock) for i in rows]
+        indices = self.existing_indices(source, missing)
+        self.find_masks(source, indices)
+        return [self.view(i, clock) for i in indices]
 
     def view(self, i: int, clock: Clock | None = None) -> View:
         """Return the view of the i-th frame; without a size in the frame, it has the size of its photograph.
@@ -164,8 +164,8 @@ class FrameFiles(FileLookup):
         self, path: Path, views: list[View], test: Set[str], points: PointCloud | None, background: Background = "black"
     ) -> Scene:
         """Return the scene at `path` with some views of the frames; test: the names of the test views."""
-        held_out = {i for i, view in enumerate(views) if view.name in test}
-        return replace(make_scene(path, views, held_out, points, background), skipped=self.skipped)
+        test_indices = {i for i, view in enumerate(views) if view.name in test}
+        return replace(make_scene(path, views, test_indices, points, background), skipped=self.skipped)
 
     @cached_property
     def _first_size(self) -> tuple[int, int]:
@@ -184,8 +184,8 @@ def _with_png(name: str) -> list[str]:
 def list_frames(parts: Parts, root: Path, *names: str) -> None:
     """Add the frames of the existing files among `names` and the points of the first file to `parts`."""
     files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
-    moments = [moment for file in filter(None, files) for moment in parts.attempt(file.moments) or []]
-    clock = parts.attempt(make_clock, parts.path, moments)
+    timestamps = [time for file in filter(None, files) for time in parts.attempt(file.timestamps) or []]
+    clock = parts.attempt(make_clock, parts.path, timestamps)
     frames = [frame for file in filter(None, files) for frame in file.frames]
     lookup = FrameFiles(root, parts.path, [frame for frame in frames if parts.attempt(frame.image_name)])
     parts.expect(lookup)
@@ -215,8 +215,8 @@ def make_view(frame: JsonFrame, name: str, size: tuple[int, int] | None, clock: 
     """
     lens = intern_lens(make_lens(frame, _frame_camera(frame, size)))
     camera, distortion = (lens.pinhole, lens) if lens.has_distortion else (lens.camera, None)
-    moment = frame.number("time")
-    time = None if clock is None or moment is None else float(clock(moment))
+    timestamp = frame.number("time")
+    time = None if clock is None or timestamp is None else float(clock(timestamp))
     matrix = read_pose(frame)
     return View(name, camera, np.linalg.inv(matrix)[:3], lens=distortion, time=time, camera_to_world=matrix)
 
@@ -226,7 +226,7 @@ def _frame_camera(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     width, height = (int(frame.number(key) or side) for key, side in zip("wh", size or (0, 0), strict=True))
     if frame.value("camera_model") == "EQUIRECTANGULAR" and 0 < min(width, height) <= max(width, height) <= MAX_SIDE:
         return panorama_lens(width, height).camera  # other programs write a meaningless focal length
-    fx, fy = _focal(frame, "fl_x", "camera_angle_x", width), _focal(frame, "fl_y", "camera_angle_y", height)
+    fx, fy = _read_focal(frame, "fl_x", "camera_angle_x", width), _read_focal(frame, "fl_y", "camera_angle_y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None or min(width, height) <= 0 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
         raise DataError(
@@ -237,7 +237,7 @@ def _frame_camera(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     return Camera(width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
 
 
-def _focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> float | None:
+def _read_focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> float | None:
     """Return a focal length in pixels, from its value or from the field of view of `pixels`; None without both."""
     length, angle = frame.number(length_key), frame.number(angle_key)
     degrees = frame.number(f"{angle_key[-1]}_fov")  # written by instant-ngp, in degrees
@@ -264,10 +264,10 @@ def make_lens(frame: JsonFrame, camera: Camera) -> Lens:
         fault = f"camera_model {quote(model)}" + (f" with {', '.join(unsupported_keys)}" if unsupported_keys else "")
         raise DataError(
             f"{frame.source}: {fault}; expected one of {', '.join(LENSES)} with its own parameters: "
-            "export the cameras with one of these, or pinhole images without distortion"
+            "export the cameras with one of these, or undistorted images with pinhole cameras"
         )
     params = (camera.fx, camera.fy, camera.cx, camera.cy, *(values[key] for key in keys))
-    name = model if model == "EQUIRECTANGULAR" else "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP[len(keys)]
+    name = model if model == "EQUIRECTANGULAR" else "OPENCV_FISHEYE" if "FISHEYE" in model else COLMAP_MODELS[len(keys)]
     return Lens(camera.width, camera.height, name, params)
 
 
@@ -323,7 +323,7 @@ class BlenderReader(Reader):
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / TRAIN_FILE)
         test_transforms = Transforms(path / TEST_FILE) if (path / TEST_FILE).is_file() else None
-        clock = make_clock(path, transforms.moments() + (test_transforms.moments() if test_transforms else []))
+        clock = make_clock(path, transforms.timestamps() + (test_transforms.timestamps() if test_transforms else []))
         files = FrameFiles(
             self.root or path, path, transforms.frames + (test_transforms.frames if test_transforms else [])
         )
@@ -358,10 +358,10 @@ class NerfstudioReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         transforms = Transforms(path / TRANSFORMS_FILE)
-        clock = make_clock(transforms.path, transforms.moments())
+        clock = make_clock(transforms.path, transforms.timestamps())
         files = FrameFiles(self.root or path, path, transforms.frames)
         views = sorted(files.views(transforms.path, self.missing, clock), key=lambda view: view.name)
-        new_names = dict(zip(files.listing, files.names, strict=True))
+        new_names = dict(zip(files.raw_names, files.names, strict=True))
         train, test = (_read_list(transforms, key, new_names) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
             test = {views[i].name for i in every_nth([view.name for view in views], holdout)}
@@ -407,25 +407,25 @@ class MultiscaleReader(Reader):
 
     def matches(self, path: Path) -> bool:
         file = path / METADATA_FILE
-        return file.is_file() and not unread_cameras(file)
+        return file.is_file() and not unsupported_cameras(file)
 
     def read(self, path: Path, holdout: int) -> Scene:
         splits = read_json(path / METADATA_FILE, limit=MAX_BYTES)
-        train, test = (_frames(path / METADATA_FILE, splits, name) for name in ("train", "test"))
+        train, test = (_read_frames(path / METADATA_FILE, splits, name) for name in ("train", "test"))
         files = FrameFiles(self.root or path, path, train + test)
         levels = {name: frame.number("label") or 0 for name, frame in zip(files.names, files.frames, strict=True)}
         views = [replace(view, downscale=2 ** levels[view.name]) for view in files.views(path, self.missing)]
-        points = path / POINTS
+        points = path / POINTS_FILE
         cloud = read_points_ply(points) if points.is_file() else None
         return files.scene(path, views, {*files.names[len(train) :]}, cloud, background="white")
 
     def list_parts(self, parts: Parts) -> None:
         super().list_parts(parts)
-        points = parts.path / POINTS
+        points = parts.path / POINTS_FILE
         parts.points = parts.attempt(read_ply_table, points) if points.is_file() else None
 
 
-def _frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
+def _read_frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
     table = splits.get(name) if isinstance(splits, dict) else None
     columns: list[Any] = [table.get(column) for column in COLUMNS] if isinstance(table, dict) else [None]
     if not all(isinstance(column, list) for column in columns) or len(set(map(len, columns))) > 1:

@@ -82,7 +82,7 @@ class View:
 
     def __post_init__(self) -> None:
         if self.image is not None:
-            object.__setattr__(self, "image", _checked_pixels(self.name, self.image))
+            object.__setattr__(self, "image", _validate_pixels(self.name, self.image))
         object.__setattr__(self, "world_to_camera", validate_pose(self.name, self.world_to_camera))
         object.__setattr__(self, "time", validate_time(self.name, self.time))
 
@@ -119,7 +119,7 @@ class View:
     def faces(self) -> list["View"]:
         """Return the views of the faces of a wide photograph; for other photographs, only this view.
 
-        Faces that the mask hides are left out.  Raises DataError when the mask excludes every pixel.
+        Faces that the mask hides are omitted.  Raises DataError when the mask excludes every pixel.
         """
         if self.lens is None or not self.lens.is_wide or self.lens.face:
             return [self]
@@ -139,11 +139,11 @@ class View:
             )
         return views
 
-    def whole_photograph(self) -> "View":
+    def full_photograph(self) -> "View":
         """Return the view of the entire photograph to which this face belongs; other views are returned unchanged."""
         if self.lens is None or not self.lens.face:
             return self
-        lens, pose = intern_lens(replace(self.lens, face="", whole=False)), FACES[self.lens.face].T
+        lens, pose = intern_lens(replace(self.lens, face="", keep_border=False)), FACES[self.lens.face].T
         name = photograph_name(self.name)
         return replace(self, name=name, camera=lens.pinhole, world_to_camera=pose @ self.world_to_camera, lens=lens)
 
@@ -175,14 +175,14 @@ class View:
         """Return the photograph at the camera's size, [height, width, 3] in [0, 1].
 
         background: the color behind transparent pixels, one or three numbers in [0, 1]; default: that of the scene.
-        The background of a render is `picture.background`.  Raises DataError when the file cannot be read or does not
-        fit the camera, and ValueError for an invalid background.
+        For a comparison with a render, pass the `background` of the render.  Raises DataError when the file cannot be
+        read or does not fit the camera, and ValueError for an invalid background.
         """
         red, green, blue = to_color(self.background if background is None else background).tolist()
         return np.asarray(load_image(self, (red, green, blue)) / np.float32(255), np.float32)
 
 
-def _checked_pixels(name: str, image: ArrayLike) -> NDArray[Any]:
+def _validate_pixels(name: str, image: ArrayLike) -> NDArray[Any]:
     """Return an image as uint8 or uint16, [height, width, 3 or 4].  Raises DataError for another shape or range."""
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or not pixels.size:
@@ -270,7 +270,7 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
     """Return a mask, [H, W], of the valid pixels of `load_image`, or None when all are valid.
 
     The entire area of a valid pixel is white in the mask file, opaque in the photograph (if alpha is a mask) and
-    covered by the photograph (with a `whole` lens).  Raises DataError like load_image.
+    covered by the photograph (if the lens has `keep_border`).  Raises DataError like load_image.
     """
     layers = []
     if view.mask_path is not None:
@@ -278,8 +278,8 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
     if view.alpha == "mask":
         pixels = _read_original(view, view.image_path, slice(3, 4))
         layers += [pixels] if pixels.size else []
-    if view.lens is not None and view.lens.whole:
-        layers.append(np.where(view.lens.shown, 255, 0).astype(np.uint8)[:, :, None])
+    if view.lens is not None and view.lens.keep_border:
+        layers.append(np.where(view.lens.visible_pixels, 255, 0).astype(np.uint8)[:, :, None])
     size = view.camera.width, view.camera.height
     masks = [
         cv2.resize(layer.astype(np.float32), size, interpolation=cv2.INTER_AREA) > MIN_WHITE * np.iinfo(layer.dtype).max
@@ -298,26 +298,26 @@ def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDA
         raise DataError(f"the view {quote(view.name)} has no photo; set its image or image_path")
     images: dict[bool, NDArray[Any]] = {}
 
-    def size(upright: bool) -> Size:
+    def read_size(upright: bool) -> Size:
         images[upright] = read_image(path, upright) if is_file else cast(NDArray[Any], view.image)
         height, width = images[upright].shape[:2]
         return width, height
 
-    pixels = images[needs_rotation(view, path if is_file else Path(view.name), size)][:, :, channels]
+    pixels = images[needs_rotation(view, path if is_file else Path(view.name), read_size)][:, :, channels]
     return view.lens.undistort_image(np.ascontiguousarray(pixels)) if view.lens and pixels.size else pixels
 
 
-def needs_rotation(view: View, path: Path, size: Callable[[bool], Size]) -> bool:
+def needs_rotation(view: View, path: Path, read_size: Callable[[bool], Size]) -> bool:
     """Return whether a photograph or mask fits the camera of its view only after its EXIF rotation.
 
-    COLMAP ignores that rotation.  size: returns (width, height) of the file, as stored for False and upright for True.
-    Raises DataError when neither size fits.
+    COLMAP ignores that rotation.  read_size: returns (width, height) of the file, as stored for False and
+    upright for True.  Raises DataError when neither size fits.
     """
-    width, height = size(False)
+    width, height = read_size(False)
     if fits_camera(view, (width, height)):
         return False
     if fits_camera(view, (height, width)):
-        width, height = size(True)
+        width, height = read_size(True)
         if fits_camera(view, (width, height)):
             return True
     camera = view.lens or view.camera
@@ -412,13 +412,13 @@ def load_exposures(views: Sequence[View]) -> list[CameraExposure | None]:
 
     Raises DataError when a file cannot be read.
     """
-    sidecars = cache(read_exposures)
+    read_cached = cache(read_exposures)
     exposures: list[CameraExposure | None] = []
     for view in views:
         if view.image_path == NO_FILE:
             exposures.append(None)
             continue
-        candidates = (sidecars(folder).get(name) for folder, name in _parent_folders(view))
+        candidates = (read_cached(folder).get(name) for folder, name in _parent_folders(view))
         exposures.append(next(filter(None, candidates), None) or read_exif_exposure(view.image_path))
     return exposures
 

@@ -18,10 +18,10 @@ from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, remain
 from clsplat.scene.view import photograph_name
 
 LOG = logging.getLogger("clsplat")
-LARGEST = 1 << 24  # bytes of a list of names
+MAX_BYTES = 1 << 24  # of a list of names
 ExcludedBy = Literal["holdout", "train", "missing"]
 ExcludedNames = Mapping[ExcludedBy, Sequence[str]]  # names to exclude, by reason: a setting, or missing files
-NONE: ExcludedNames = {}
+NO_NAMES: ExcludedNames = {}
 NOTATIONS = "expected a number, {every, offset}, {names: […]} or {file: …}"
 
 
@@ -29,7 +29,7 @@ def _require_text(value: Any) -> Any:
     if not isinstance(value, str):
         raise ValueError("expected names of photos as strings: put numbers in quotes, as in '0042'")
     if not value.strip():
-        raise ValueError("expected names of photos, none of them empty")
+        raise ValueError("expected names of photos, got an empty name")
     return value
 
 
@@ -69,9 +69,9 @@ class ViewSelection(Settings):
         return value
 
     @model_validator(mode="after")
-    def _check_kind(self) -> "ViewSelection":
-        kinds = [self.every, self.names, self.file]
-        if sum(value is not None for value in kinds) != 1 or (self.offset and self.every is None):
+    def _check_selectors(self) -> "ViewSelection":
+        selectors = [self.every, self.names, self.file]
+        if sum(value is not None for value in selectors) != 1 or (self.offset and self.every is None):
             raise ValueError(NOTATIONS)
         if self.every is not None and self.offset >= self.every:
             raise ValueError(f"'offset' must be less than 'every', {self.every}")
@@ -81,7 +81,7 @@ class ViewSelection(Settings):
         path = super().input_path(key, scene)
         return path and Path(scene or "") / path
 
-    def select(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NONE) -> set[int]:
+    def select(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NO_NAMES) -> set[int]:
         """Return the indices of the selected `names`.
 
         folders: the folders in which a relative file is searched, in order.  excluded: names that must not be selected;
@@ -90,18 +90,18 @@ class ViewSelection(Settings):
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
         source, lines = self._read_names(folders)
-        index, indexes = _NameIndex(names), {key: _NameIndex(group) for key, group in excluded.items()}
-        matches_of = {name: index.find_indices(name) for name in lines}
-        for name in [name for name, matches in matches_of.items() if not matches]:
-            for key in (key for key, group in indexes.items() if group.find_indices(name)):
+        index, excluded_indexes = _NameIndex(names), {key: _NameIndex(group) for key, group in excluded.items()}
+        matches_by_name = {name: index.find_indices(name) for name in lines}
+        for name in [name for name, matches in matches_by_name.items() if not matches]:
+            for key in (key for key, group in excluded_indexes.items() if group.find_indices(name)):
                 if key != "missing":
                     raise _excluded_error(source, name, key)
-                del matches_of[name]
-        if count := len({*lines}) - len(matches_of):
+                del matches_by_name[name]
+        if count := len({*lines}) - len(matches_by_name):
             LOG.info("%s: skipped %s whose photo is missing", source, pluralize(count, "name"))
-        return {i for name, matches in matches_of.items() for i in _require_one_match(name, matches, names, source)}
+        return {i for name, rows in matches_by_name.items() for i in _require_one_match(name, rows, names, source)}
 
-    def check(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NONE) -> list[str]:
+    def check(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NO_NAMES) -> list[str]:
         """Return the names that the list matches; empty for a selection of every n-th view.
 
         excluded: names that must not be selected.  Raises DataError for a listed name that matches only excluded names
@@ -125,15 +125,15 @@ class ViewSelection(Settings):
             return "the list of names", self.names or []
         files = [folder / self.file for folder in folders]
         path = next((file for file in files if file.is_file()), files[-1])
-        lines = (line.strip() for line in read_text(path, limit=LARGEST).splitlines())
+        lines = (line.strip() for line in read_text(path, limit=MAX_BYTES).splitlines())
         if names := [line for line in lines if line and not line.startswith("#")]:
             return str(path), names
         raise DataError(f"{path}: the file is empty; write one photo name per line")
 
 
 Number = Annotated[int, Field(ge=0)]
-Chosen = Annotated[Number | ViewSelection, in_one_sentence(NOTATIONS)]
-ChosenOrAuto = Annotated[Number | ViewSelection | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
+Selection = Annotated[Number | ViewSelection, in_one_sentence(NOTATIONS)]
+SelectionOrAuto = Annotated[Number | ViewSelection | Literal["auto"], in_one_sentence(f"{NOTATIONS}, or auto")]
 
 
 def _excluded_error(source: str, name: str, key: ExcludedBy) -> DataError:
@@ -227,7 +227,7 @@ class Split:
         return self.holdout if isinstance(self.holdout, int) else 0
 
     def apply(self, scene: Scene) -> Scene:
-        """Return a scene that was read with `reader_holdout` with this split.
+        """Return `scene`, which was read with `reader_holdout`, with this split.
 
         Raises DataError for unknown names, or when one of the splits contains all views.
         """
@@ -238,11 +238,11 @@ class Split:
             test = _select(scene, "holdout", holdout, names, folders, {"missing": scene.skipped})
             if len(test) == len(names):
                 raise DataError(
-                    f"{scene.path}: scene.holdout selects all {len(names)} photos for testing; name fewer, "
+                    f"{scene.path}: scene.holdout selects all {len(names)} photos for testing; name fewer photos, "
                     "or raise `every`, to leave some for training"
                 )
             if not test:
-                remedy = "lower its offset" if holdout.every else "name photos that are there"
+                remedy = "lower its offset" if holdout.every else "name photos of the dataset"
                 raise DataError(
                     f"{scene.path}: scene.holdout selects 0 of {len(names)} photos for testing; expected some: "
                     f"{remedy}, or set scene.holdout to 0 for none"
@@ -265,7 +265,7 @@ class Split:
         return self.with_validation(scene, left_out_names)
 
     def check(self, folder: Path, names: Sequence[str]) -> None:
-        """Raise DataError for lists with unknown names, or with a photograph that is in two lists.
+        """Raise DataError if a list has an unknown name, or if a photograph is in two lists.
 
         names: the photographs in `folder`, which need not have poses yet.
         """
@@ -289,10 +289,10 @@ class Split:
             every, offset = self.holdout.every or 0, self.holdout.offset
         return {sorted(names)[i] for i in every_nth(sorted(names), every, offset)}
 
-    def with_validation(self, scene: Scene, left_out: Sequence[str] = ()) -> Scene:
+    def with_validation(self, scene: Scene, omitted_names: Sequence[str] = ()) -> Scene:
         """Return the scene with some of its training views moved to the validation views.
 
-        left_out: names of views that are not in the scene because of `train`.  Raises the errors of `apply`.
+        omitted_names: names of views that are not in the scene because of `train`.  Raises the errors of `apply`.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:
@@ -300,7 +300,7 @@ class Split:
         if self.validation == "auto":
             fold = _validation_fold(scene)
         else:
-            fold = _select_training(scene, "validation", self.validation, folders, left_out)
+            fold = _select_training(scene, "validation", self.validation, folders, omitted_names)
         train = tuple(i for i in scene.train if i not in fold)
         if not fold or not train:
             raise DataError(
@@ -319,12 +319,12 @@ def _with_test(scene: Scene, test: set[int]) -> Scene:
 
 
 def _select_training(
-    scene: Scene, key: str, choice: int | ViewSelection, folders: Sequence[Path], left_out: Sequence[str] = ()
+    scene: Scene, key: str, choice: int | ViewSelection, folders: Sequence[Path], omitted_names: Sequence[str] = ()
 ) -> set[int]:
     """Return the indices of the selected training views.  key: the name of the setting, for messages."""
     names = [scene.views[i].name for i in scene.train]
     test_names = [scene.views[i].name for i in scene.test]
-    excluded: ExcludedNames = {"holdout": test_names, "train": left_out, "missing": scene.skipped}
+    excluded: ExcludedNames = {"holdout": test_names, "train": omitted_names, "missing": scene.skipped}
     return {scene.train[i] for i in _select(scene, key, choice, names, folders, excluded)}
 
 
@@ -334,7 +334,7 @@ def _select(
     choice: int | ViewSelection,
     names: Sequence[str],
     folders: Sequence[Path],
-    excluded: ExcludedNames = NONE,
+    excluded: ExcludedNames = NO_NAMES,
 ) -> set[int]:
     """Return the indices of the selected names; a number n selects every n-th name from the first, and 0 selects none.
 

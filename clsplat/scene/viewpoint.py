@@ -15,9 +15,9 @@ from clsplat.scene.view import View
 MIN_TURN = 0.1  # smallest second eigenvalue of the right axes of cameras that turn enough: 18 degrees
 MAX_ROLL = 0.15  # largest ratio of the third to the second eigenvalue of level cameras
 MIN_UP = 0.2  # smallest component of the mean up axis along the axis that determines its sign
-AGREED, FURTHEST = 0.5, 75.0  # a mean up axis longer than this is less than this many degrees from the up direction
+MIN_AGREEMENT, MAX_TILT = 0.5, 75.0  # a mean up axis longer than MIN_AGREEMENT is at most MAX_TILT degrees off
 PRIOR = 1e-3  # weight of the center of the splats, which determines the distance if all axes are parallel
-START = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a scene without views
+START_CAMERA = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a scene without views
 QUANTILES = 0.05, 0.95  # of the splats along each axis: the faces of the box to look at
 DISTANCE = 2.2  # of the start view from the center of the box, in halves of its diagonal
 
@@ -48,7 +48,7 @@ class Viewpoint:
             up = np.array([0.0, -1.0, 0.0])  # up in an OpenCV camera
             radius = spread or 1.0
             eye = center + DISTANCE * radius * np.array([0.35, -0.25, -0.9])
-            return cls(center, up, radius, START.fx, View.looking_at(eye, center, up, START, "start"))
+            return cls(center, up, radius, START_CAMERA.fx, View.looking_at(eye, center, up, START_CAMERA, "start"))
         poses = np.stack([view.world_to_camera for view in views])
         centers = np.stack([view.position for view in views])
         pivot = nearest_to_axes(centers, poses[:, 2, :3], center)
@@ -67,7 +67,7 @@ def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     right, up, forward = poses[:, 0, :3], -poses[:, 1, :3].mean(axis=0), poses[:, 2, :3].mean(axis=0)
     squares, axes = np.linalg.eigh(right.T @ right / len(right))
     axis, length = axes[:, 0], np.linalg.norm(up)
-    is_tilted = length > AGREED and abs(axis @ up) < length * np.cos(np.radians(FURTHEST))
+    is_tilted = length > MIN_AGREEMENT and abs(axis @ up) < length * np.cos(np.radians(MAX_TILT))
     if squares[1] >= MIN_TURN and squares[0] <= MAX_ROLL * squares[1] and not is_tilted:
         sign = axis @ up if abs(axis @ up) > MIN_UP else -axis @ forward  # cameras look down more often than up
         return np.asarray(axis if sign > 0 else -axis)

@@ -21,7 +21,7 @@ Bools = NDArray[np.bool_]
 Cells = NDArray[np.integer]  # [M, 3], indices in a grid
 LONG_SIDE = 400  # px, of the downscaled photographs
 MAX_VIEWS = 64  # largest number of views that are used as silhouettes
-COARSEST, FINEST = 16, 256  # cells along a side of the box
+MIN_RESOLUTION, MAX_RESOLUTION = 16, 256  # cells per side of the box
 HALF, OPAQUE = 127, 250  # alpha above which a pixel is in the silhouette, and from which its color is used
 MIN_VIEWS, MIN_FRACTION = 2, 0.25  # smallest number and fraction of views that must see a cell
 HALF_DIAGONAL = 0.75**0.5  # of a cube of side 1
@@ -46,12 +46,12 @@ class Silhouette:
         matrix = (np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]) @ pose).astype(np.float32)
         # no matrix product: BLAS sums in an order that depends on the number of threads
         x, y, depth = (sum(row[k] * points[:, k] for k in range(3)) + row[3] for row in matrix)
-        in_front = depth > 0
-        safe_depth = np.where(in_front, depth, 1)
+        is_in_front = depth > 0
+        safe_depth = np.where(is_in_front, depth, 1)
         row = np.floor(y / safe_depth).clip(-1, c.height).astype(int)
         column = np.floor(x / safe_depth).clip(-1, c.width).astype(int)
-        inside = in_front & (row >= 0) & (row < c.height) & (column >= 0) & (column < c.width)
-        return Projection(inside, row[inside], column[inside], depth[inside])
+        is_inside = is_in_front & (row >= 0) & (row < c.height) & (column >= 0) & (column < c.width)
+        return Projection(is_inside, row[is_inside], column[is_inside], depth[is_inside])
 
     def radius(self, size: float, depth: Floats) -> int:
         """Return an upper bound, px, of the projected radius of balls of radius `size` at the depths `depth`."""
@@ -64,7 +64,7 @@ class Silhouette:
 class Projection:
     """The projections of M points, of which K are in the image."""
 
-    inside: Bools  # [M]
+    is_inside: Bools  # [M]
     row: NDArray[np.integer]  # [K] px
     column: NDArray[np.integer]  # [K] px
     depth: Floats  # [K] scene units
@@ -81,31 +81,31 @@ def hull_points(
     """Return at most `count` colored points on the hull, in a box of side 2 `half_side` around `center`, [3].
 
     load: returns a photograph with its alpha, [H, W, 4], or None without transparency.  Cells are split until about
-    `count` of them are on the surface, or until FINEST of them are along each side of the box.
+    `count` of them are on the surface, or until MAX_RESOLUTION of them are along each side of the box.
     """
-    silhouettes = list(_silhouettes(views, load))
-    is_full, resolution = np.zeros((COARSEST,) * 3, bool), COARSEST
+    silhouettes = list(_load_silhouettes(views, load))
+    is_full, resolution = np.zeros((MIN_RESOLUTION,) * 3, bool), MIN_RESOLUTION
     cells: Cells = np.argwhere(~is_full)
     while True:
-        centers, side = _centers(cells, center, half_side, resolution)
-        is_inside, cut = _classify(silhouettes, centers, HALF_DIAGONAL * side)
+        centers, side = _cell_centers(cells, center, half_side, resolution)
+        is_inside, is_cut = _classify(silhouettes, centers, HALF_DIAGONAL * side)
         is_full[tuple(cells[is_inside].T)] = True
-        cells, resolution = _split(cells[cut]), 2 * resolution
+        cells, resolution = _split(cells[is_cut]), 2 * resolution
         is_full = is_full.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
-        if cut.sum() >= count or resolution == FINEST:
+        if is_cut.sum() >= count or resolution == MAX_RESOLUTION:
             break
-    is_inside, _ = _classify(silhouettes, _centers(cells, center, half_side, resolution)[0], 0)
+    is_inside, _ = _classify(silhouettes, _cell_centers(cells, center, half_side, resolution)[0], 0)
     is_full[tuple(cells[is_inside].T)] = True
-    points, side = _centers(
+    points, side = _cell_centers(
         np.argwhere(is_full & ~scipy.ndimage.binary_erosion(is_full, border_value=1)), center, half_side, resolution
     )
-    colors, visible = _colors(silhouettes, points, side)
-    points, colors = points[visible], colors[visible]
+    colors, is_visible = _mean_colors(silhouettes, points, side)
+    points, colors = points[is_visible], colors[is_visible]
     sampled_rows = np.sort(np.random.default_rng([seed, count]).permutation(len(points))[:count])
     return PointCloud(points[sampled_rows], colors[sampled_rows])
 
 
-def _silhouettes(views: Sequence[View], load: Callable[[View], NDArray[np.uint8] | None]) -> Iterator[Silhouette]:
+def _load_silhouettes(views: Sequence[View], load: Callable[[View], NDArray[np.uint8] | None]) -> Iterator[Silhouette]:
     for index in np.unique(np.linspace(0, len(views) - 1, min(len(views), MAX_VIEWS)).round().astype(int)):
         view = views[index]
         small_view = view.resized(view.downscale * max(1.0, max(view.camera.width, view.camera.height) / LONG_SIDE))
@@ -119,7 +119,7 @@ def _split(cells: Cells) -> Cells:
     return (2 * cells[:, None] + np.indices((2, 2, 2)).reshape(3, -1).T).reshape(-1, 3)
 
 
-def _centers(cells: Cells, center: Floats, half_side: float, resolution: int) -> tuple[NDArray[np.float32], float]:
+def _cell_centers(cells: Cells, center: Floats, half_side: float, resolution: int) -> tuple[NDArray[np.float32], float]:
     """Return the centers, [M, 3], and the side of cells in a box with `resolution` cells along each side."""
     side = 2 * half_side / resolution
     return (center - half_side + side * (cells + 0.5)).astype(np.float32), side
@@ -136,23 +136,23 @@ def _classify(silhouettes: Sequence[Silhouette], centers: NDArray[np.float32], r
         if not len(projection.depth):
             continue
         kernel = np.ones((2 * silhouette.radius(radius, projection.depth) + 1,) * 2, np.uint8)
-        rows = remaining[projection.inside]
+        rows = remaining[projection.is_inside]
         view_counts[rows] += 1
         is_full[rows[cv2.erode(silhouette.alpha, kernel)[projection.row, projection.column] <= HALF]] = False
-        is_remaining = ~projection.inside
-        is_remaining[projection.inside] = cv2.dilate(silhouette.alpha, kernel)[projection.row, projection.column] > HALF
-        remaining = remaining[is_remaining]
+        is_left = ~projection.is_inside
+        is_left[projection.is_inside] = cv2.dilate(silhouette.alpha, kernel)[projection.row, projection.column] > HALF
+        remaining = remaining[is_left]
     is_candidate = np.zeros(len(centers), bool)
     is_candidate[remaining] = True
     is_candidate &= view_counts >= max(MIN_VIEWS, MIN_FRACTION * len(silhouettes))
     return is_candidate & is_full, is_candidate & ~is_full
 
 
-def _colors(
+def _mean_colors(
     silhouettes: Sequence[Silhouette], points: NDArray[np.float32], side: float
 ) -> tuple[NDArray[np.float32], Bools]:
     """Return the mean colors of points in the views that show them, [M, 3] in [0, 1], and a visibility mask, [M]."""
-    total, number = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
+    sums, counts = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
     for silhouette in silhouettes:
         projection, camera = silhouette.project(points), silhouette.view.camera
         if not len(projection.depth):
@@ -163,7 +163,7 @@ def _colors(
         is_visible = projection.depth <= nearest[projection.row // cell, projection.column // cell] + MAX_BEHIND * side
         rgba = silhouette.rgba[projection.row, projection.column]
         is_visible &= rgba[:, 3] >= OPAQUE
-        rows = np.flatnonzero(projection.inside)[is_visible]
-        total[rows] += rgba[is_visible, :3]
-        number[rows] += 1
-    return np.asarray(total / np.maximum(255 * number, 1)[:, None], np.float32), number > 0
+        rows = np.flatnonzero(projection.is_inside)[is_visible]
+        sums[rows] += rgba[is_visible, :3]
+        counts[rows] += 1
+    return np.asarray(sums / np.maximum(255 * counts, 1)[:, None], np.float32), counts > 0

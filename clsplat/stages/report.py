@@ -18,7 +18,7 @@ from clsplat.core.reading import read_text
 from clsplat.metrics.perceptual import Image
 from clsplat.metrics.views import QUANTILES, render_view
 from clsplat.prepare.gather import summarize_placement
-from clsplat.scene.scene import SPLITS, position_text
+from clsplat.scene.scene import SPLITS, format_position
 from clsplat.stages.advice import collect_advice
 from clsplat.stages.export import sky_gaussians
 from clsplat.training.best_model import Scores
@@ -316,7 +316,7 @@ def _summary_values(run: Run) -> dict[str, str]:
     values["steps"] = f"{run.step:,}"
     values["training"] = duration_text(run.train_seconds)
     if run.scene.origin.any():
-        values["origin of the coordinates"] = position_text(run.scene.origin)
+        values["origin of the coordinates"] = format_position(run.scene.origin)
     return values
 
 

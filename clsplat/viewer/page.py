@@ -14,7 +14,7 @@ from clsplat.core.errors import OutputError
 from clsplat.core.files import write_text
 from clsplat.core.page import data_url, downscale, inline, render
 from clsplat.core.reading import read_file
-from clsplat.scene.scene import Scene, position_text
+from clsplat.scene.scene import Scene, format_position
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer.packing import PackedModel
@@ -140,7 +140,7 @@ class Page:
             facts[f"screen filter{suffix}"] = f"pixel box, drawn here as a blur of {blur}" if "box" in header else blur
             facts[f"size{suffix}"] = f"{len(packed.data) / 1e6:.2f} MB"
         facts |= {"views": f"{len(self.views):,}"} if self.views else {}
-        return facts | ({"origin": position_text(self.origin)} if self.origin.any() else {})
+        return facts | ({"origin": format_position(self.origin)} if self.origin.any() else {})
 
 
 def is_viewer(path: Path) -> bool:

@@ -183,5 +183,5 @@ def test_functions_raise_the_errors_of_the_commands(call, error, message):
 
 
 def test_render_of_size_zero_is_refused(few_steps, tmp_path):
-    with pytest.raises(DataError, match="raise it to 1"):
+    with pytest.raises(DataError, match="expected a downscale of at least 1"):
         clsplat.render_views(few_steps, out=tmp_path / "out", downscale=0)

@@ -15,7 +15,7 @@ from clsplat.formats.table import detect
 from clsplat.formats.table import read as read_ply
 from clsplat.metrics.perceptual import Lpips
 from clsplat.pipeline.loading import load
-from clsplat.scene.colmap import cameras_binary, cameras_text
+from clsplat.scene.colmap import read_cameras_binary, read_cameras_text
 from clsplat.scene.images import read_header, read_image
 from clsplat.scene.points import read_points_ply
 from clsplat.scene.transforms_json import Transforms
@@ -48,8 +48,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "image": read_image,
     "image header": read_header,
     "transforms": Transforms,
-    "COLMAP binary": lambda path: list(cameras_binary(path)),
-    "COLMAP text": lambda path: list(cameras_text(path)),
+    "COLMAP binary": lambda path: list(read_cameras_binary(path)),
+    "COLMAP text": lambda path: list(read_cameras_text(path)),
     "LPIPS": lambda path: Lpips(path, "0..1"),
     "file": read_file,
     "JSON": read_json,

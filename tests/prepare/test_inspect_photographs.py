@@ -190,7 +190,7 @@ def test_cameras_of_other_programs_are_reported(tmp_path, name, content, program
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).write_text(content)
     inspection = Inspection.from_folder(tmp_path)
-    expected = f"the cameras of {program} in {tmp_path / name} are not read; to use them, export COLMAP's format"
+    expected = f"the cameras of {program} in {tmp_path / name} are not supported; export them in COLMAP's format"
     assert texts(inspection, "warning")[1].startswith(expected)
     assert inspection.next_step
     with pytest.raises(DataError, match=f"photos without cameras; .*the cameras of {program}"):

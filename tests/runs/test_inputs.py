@@ -76,9 +76,9 @@ def views(folder: Path) -> tuple[View, ...]:
 def test_damaged_test_view_stops_a_run_before_its_first_step(scene, tmp_path):
     file = damage(read_scene(scene).split("test")[1].image_path)
     done = command("run", "smoke", "--scene", scene, "--out", tmp_path / "run", expect=3)
-    assert f"1 of 10 image files cannot be trained on: {file} (not an image, or a damaged one" in done.stderr
+    assert f"1 of 10 image files cannot be used: {file} (not an image, or a damaged one" in done.stderr
     assert not (tmp_path / "run" / "metrics.jsonl").exists()
-    with pytest.raises(DataError, match="1 of 10 image files cannot be trained on"):
+    with pytest.raises(DataError, match="1 of 10 image files cannot be used"):
         clsplat.Trainer(scene, "smoke")
 
 
@@ -89,7 +89,7 @@ def test_one_message_lists_all_damaged_files(scene, tmp_path):
     with pytest.raises(DataError) as error:
         opening.open_run(load("smoke", [f"scene.path='{scene}'"]), tmp_path / "run", None)
     text = str(error.value)
-    assert text.startswith(f"{scene}: 6 of 10 image files cannot be trained on: {train_views[1].image_path} (not an")
+    assert text.startswith(f"{scene}: 6 of 10 image files cannot be used: {train_views[1].image_path} (not an")
     assert text.count(".png (") == 3
     assert text.endswith("; …")
     assert not (tmp_path / "run").exists()
@@ -377,7 +377,7 @@ def test_dry_run_of_a_resume_prints_the_step(scene, tmp_path):
 def test_dry_run_finds_damaged_photographs(scene, tmp_path):
     damage(views(scene)[1].image_path)
     done = command("run", "smoke", "--scene", scene, "--out", tmp_path / "run", "--dry-run", expect=3)
-    assert "1 of 10 image files cannot be trained on" in done.stderr
+    assert "1 of 10 image files cannot be used" in done.stderr
     assert not (tmp_path / "run").exists()
 
 

@@ -142,7 +142,7 @@ def test_cameras_json_has_undistorted_cameras(model, scene_of, tmp_path, caplog)
     scene = scene_of(model, 3)
     with caplog.at_level(logging.WARNING, "clsplat"):
         clsplat.write_cameras(scene, tmp_path, "inria")
-    assert "the principal point at the center of the image; it is up to" in caplog.text
+    assert "that the principal point is the image center; it is up to" in caplog.text
     result = camera_files.read_inria(tmp_path / "cameras.json")
     for a, b in zip(scene.views, result, strict=True):
         assert (b.name, b.camera) == (a.name, a.camera)
@@ -184,7 +184,7 @@ def test_damaged_cameras_json_is_refused(fault, scene_of, tmp_path):
 @pytest.mark.parametrize(("form", "lines"), [("colmap", 1), ("inria", 1), ("nerfstudio", 0)])
 def test_lost_split_is_logged_in_one_line(form, lines, scene_of, tmp_path, caplog):
     clsplat.write_cameras(scene_of("PINHOLE"), tmp_path, form)
-    words = f"{tmp_path}: {form} does not store which views are for testing, 2 of 5; nerfstudio does"
+    words = f"{tmp_path}: {form} does not store which 2 of 5 views are test views; nerfstudio does"
     assert [record.levelname for record in caplog.records if record.getMessage() == words] == ["WARNING"] * lines
 
 
@@ -194,7 +194,7 @@ def test_existing_files_are_not_replaced(form, scene_of, tmp_path):
     first = clsplat.write_cameras(scene, tmp_path / "a", form)
     again = clsplat.write_cameras(scene, tmp_path / "b", form)
     assert [a.read_bytes() for a in first] == [b.read_bytes() for b in again], "the same bytes"
-    with pytest.raises(ConfigError, match="exists; give another folder"):
+    with pytest.raises(ConfigError, match="exists; choose another folder"):
         clsplat.write_cameras(scene, tmp_path / "a", form)
 
 

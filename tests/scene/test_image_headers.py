@@ -38,7 +38,7 @@ def test_real_photographs(name):
     for file in files[:10]:
         header = read_header(file)
         assert (header.width, header.height) == image_size(file)
-        assert header.complete
+        assert header.is_complete
 
 
 @pytest.mark.parametrize(
@@ -55,9 +55,9 @@ def test_orientation(tmp_path, order, orientation, expected):
 def test_image_end_is_before_appended_data(tmp_path, suffix, behind):
     whole = encoded(suffix)
     (tmp_path / f"a{suffix}").write_bytes(whole + behind)
-    assert read_header(tmp_path / f"a{suffix}").complete
+    assert read_header(tmp_path / f"a{suffix}").is_complete
     (tmp_path / f"a{suffix}").write_bytes(whole[: len(whole) * 2 // 3])
-    assert not read_header(tmp_path / f"a{suffix}").complete
+    assert not read_header(tmp_path / f"a{suffix}").is_complete
 
 
 def test_files_that_are_not_images(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import DataError
 from clsplat.scene import camera as lens_room
-from clsplat.scene.camera import MAX_ROUNDS, MODELS, WIDE, Lens, intern_lens
+from clsplat.scene.camera import MAX_ITERATIONS, MODELS, WIDE, Lens, intern_lens
 from tests.support.camera_rings import FISHEYE, STRONG
 from tests.support.data_sets import data_set
 
@@ -31,11 +31,11 @@ def test_every_model_projects_like_colmap():
 def test_converged_pixels_match_the_full_iteration(lens):
     """Beyond the photograph some never settle, and some become infinite."""
     x, y = np.meshgrid(np.linspace(-40, lens.width + 40, 97), np.linspace(-40, lens.height + 40, 71))
-    fx, fy, cx, cy, rest = lens._split
+    fx, fy, cx, cy, rest = lens._intrinsics
     goal = np.stack([(x.ravel() - cx) / fx, (y.ravel() - cy) / fy])
     actual = goal
     with np.errstate(all="ignore"):
-        for _ in range(MAX_ROUNDS):
+        for _ in range(MAX_ITERATIONS):
             actual = lens_room._newton_step(MODELS[lens.model][1], rest, actual, goal)
     u, v = (item.ravel() for item in lens.undistort(x, y))
     good = np.isfinite(u)
@@ -52,10 +52,10 @@ def test_photographs_of_one_camera_share_one_map(monkeypatch):
     photograph = np.zeros((STRONG.height, STRONG.width, 3), np.uint8)
     for _ in range(3):
         first = intern_lens(
-            replace(STRONG, params=(161.0, *STRONG.params[1:]), whole=True)
+            replace(STRONG, params=(161.0, *STRONG.params[1:]), keep_border=True)
         )  # a lens of this test alone
         first.undistort_image(photograph)
-        assert first.shown.any()
+        assert first.visible_pixels.any()
     assert drawn[0] is drawn[1] is drawn[2]
     assert len(computed) == 2  # the map, and the pixels that are shown
 
@@ -78,7 +78,7 @@ def test_undistorted_photographs_agree_with_the_lens(lens):
 @pytest.mark.parametrize("lens", [STRONG, FISHEYE])
 def test_wide_pinhole_covers_the_whole_image(lens):
     """Every ray within 60 degrees and twice the size is in the wide pinhole; it shows what its mask says, to 0.1 px."""
-    lens = replace(lens, whole=True)
+    lens = replace(lens, keep_border=True)
     y, x = np.meshgrid(np.arange(lens.height) + 0.5, np.arange(lens.width) + 0.5, indexing="ij")
     u, v = lens.undistort(x, y)
     camera = lens.pinhole
@@ -89,15 +89,15 @@ def test_wide_pinhole_covers_the_whole_image(lens):
     assert columns[near].max() < camera.width + 1
     assert rows[near].max() < camera.height + 1
     seen = lens.undistort_image(np.stack([u, v, v], axis=2).astype(np.float32))
-    py, px = np.nonzero(lens.shown)
-    assert 0.5 < lens.shown.mean() < 1
+    py, px = np.nonzero(lens.visible_pixels)
+    assert 0.5 < lens.visible_pixels.mean() < 1
     inner = (py % 7 == 0) | (px % 7 == 0)
     py, px = py[inner], px[inner]
     actual = seen[py, px, :2] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
     error = np.abs(actual - np.stack([px + 0.5, py + 0.5], axis=1)).max(axis=1)
     x, y = lens.distort((px + 0.5 - camera.cx) / camera.fx, (py + 0.5 - camera.cy) / camera.fy)
-    whole = (x > 0.5) & (y > 0.5) & (x < lens.width - 0.5) & (y < lens.height - 0.5)  # not on the last half pixel
-    assert error[whole].max() < 0.1
+    is_inner = (x > 0.5) & (y > 0.5) & (x < lens.width - 0.5) & (y < lens.height - 0.5)  # not on the last half pixel
+    assert error[is_inner].max() < 0.1
 
 
 @pytest.mark.parametrize("lens", [STRONG, FISHEYE])

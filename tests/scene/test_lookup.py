@@ -97,7 +97,7 @@ REFUSALS = {  # the kind of dataset, its names, the files on disk, and what is s
     "a mask": (JSON, ["images/a.jpg"], ["masks/a.jpg"], "1 of 1 image files are missing"),
     "a letter less": (JSON, ["images/IMG_01.jpg"], ["images/IMG_1.jpg"], "nearest file is images/IMG_1.jpg, searched"),
     "another split": (BLENDER, ["./test/r_0"], ["val/r_0.png"], "1 of 1 image files are missing"),
-    "nothing": (JSON, ["images/a.jpg"], [], "no images in that folder"),
+    "nothing": (JSON, ["images/a.jpg"], [], "contains no images"),
     "outside": (JSON, ["../other/a.jpg"], ["../other/a.jpg"], "'../other/a.jpg' is not a path below"),
     "an absolute path": ("colmap", ["/x/a.jpg"], ["images/b.jpg"], "/x/a.jpg' is not a path below"),
 }
@@ -208,7 +208,7 @@ def test_largest_nested_model_of_equal_photographs_is_used(tmp_path: Path) -> No
     write_model(tmp_path / "colmap_a" / "0", small)
     write_model(tmp_path / "colmap_b", orbit(), "txt")
     write_model(tmp_path / "colmap_c" / "0", orbit())
-    note = "the COLMAP dataset in colmap_b is used, of 3 models of these photos"
+    note = "the COLMAP dataset in colmap_b is used, out of 3 models of these photos"
     assert Inspection.from_folder(tmp_path).facts.notes == [note]
     write_model(tmp_path / "colmap_c" / "0", replace(small, images=[ImageEntry("other.png")]))
     message = refusal(read_scene, tmp_path)

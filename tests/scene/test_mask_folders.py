@@ -116,7 +116,7 @@ def test_mask_of_another_size_is_refused_before_the_first_step(tiny_scene, tmp_p
     cv2.imwrite(str(file), np.full((30, 40), 255, np.uint8))
     with pytest.raises(DataError, match="the image is 40x30 pixels, its camera 40x40") as error:
         train(tiny_scene, tmp_path / "run", f"scene.masks='{masks}'")
-    assert f"1 of 20 image files cannot be trained on: {file}" in str(error.value)
+    assert f"1 of 20 image files cannot be used: {file}" in str(error.value)
 
 
 # ---- they alone train, and are measured

@@ -186,7 +186,7 @@ def test_damaged_static_mask_is_refused_before_training(tmp_path):
         frame["static_path"] = "still.png"
     path = write(tmp_path / "a", **LENS, frames=table)
     cv2.imwrite(str(path / "still.png"), np.zeros((5, 7), np.uint8))
-    with pytest.raises(DataError, match=r"1 of 4 image files cannot be trained on: .*still.png"):
+    with pytest.raises(DataError, match=r"1 of 4 image files cannot be used: .*still.png"):
         require_decodable(path, decode_all(read_scene(path).views))
     assert any("static mask" in finding.text for finding in Inspection.from_folder(path).findings)
 

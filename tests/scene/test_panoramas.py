@@ -90,7 +90,7 @@ def test_faces_show_their_own_rays(lens: Lens) -> None:
     for face in lens.faces:
         shown = face.undistort_image(picture_of_rays(lens))
         error = np.abs(shown - face_rays(face)).max(axis=-1)
-        assert error[face.shown].max() < 2.5 / lens.camera.fx**2 + 0.01, face.face
+        assert error[face.visible_pixels].max() < 2.5 / lens.camera.fx**2 + 0.01, face.face
         assert face.pinhole.fx >= lens.camera.fx, "the center is not sampled below the photo"
 
 
@@ -99,10 +99,10 @@ def test_fisheye_faces_mask_what_the_lens_does_not_show() -> None:
     assert [face.face for face in FISHEYE.faces] == ["front", "right", "left", "up", "down"]
     for face in FISHEYE.faces:
         angle = np.degrees(np.arccos(face_rays(face)[..., 2]))
-        assert face.shown[angle < 107].all()
-        assert not face.shown[angle > 110.2].any()
+        assert face.visible_pixels[angle < 107].all()
+        assert not face.visible_pixels[angle > 110.2].any()
     front, right = FISHEYE.faces[:2]
-    assert front.shown.all()
+    assert front.visible_pixels.all()
     assert front.pinhole.width > 1.3 * right.pinhole.width, "a face is cropped to what it shows"
     view = View("a.png", FISHEYE.pinhole, np.eye(3, 4), lens=FISHEYE)
     assert [face.name for face in view.faces()][:2] == ["a/cube_front.png", "a/cube_right.png"]
@@ -119,7 +119,7 @@ def test_folded_polynomials_end_where_they_fold() -> None:
     lens = Lens(400, 400, "SIMPLE_RADIAL_FISHEYE", (180.0, 200.0, 200.0, -1 / (3 * np.radians(100) ** 2)))
     assert lens.is_wide
     for face in lens.faces:
-        assert not face.shown[np.degrees(np.arccos(face_rays(face)[..., 2])) > 100.2].any()
+        assert not face.visible_pixels[np.degrees(np.arccos(face_rays(face)[..., 2])) > 100.2].any()
 
 
 @pytest.fixture
@@ -213,8 +213,8 @@ def test_nerfstudio_panoramas_face_forward(tmp_path: Path) -> None:
     ("model", "params", "message"),
     [
         ("EQUIRECTANGULAR", (100, 64), "expected the size of its images, 128, 64"),
-        ("FISHEYE", (20, 1e9, 64, 32), "focal lengths that fit"),
-        ("FOV", (50, 51, 30.5, 520, 0.1), "shows nothing"),
+        ("FISHEYE", (20, 1e9, 64, 32), "focal lengths that match"),
+        ("FOV", (50, 51, 30.5, 520, 0.1), "has no visible pixels"),
         ("EUCM", (20, 20, 64, 32, float("nan"), 1), "finite numbers"),
     ],
 )

@@ -99,7 +99,7 @@ def before_a_sky(view):
 
 
 def swept(table, shown):
-    return sweep_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, allowed=shown)
+    return sweep_points(table[0], LOOK_AT, before_a_sky, 50_000, 0, load_mask=shown)
 
 
 def test_pixels_are_placed_at_exact_depths(table):
@@ -152,7 +152,7 @@ def test_missing_surfaces_are_added(rng):
     center, load = np.array([0, 0, DEPTH]), lambda view: photographs[view.name]
     alone = sweep_points(views, center, load, 10**6, 0).positions
     left = alone[alone[:, 0] < 0].astype(np.float64)
-    new = sweep_points(views, center, load, 10**6, 0, existing=left).positions
+    new = sweep_points(views, center, load, 10**6, 0, points=left).positions
     assert len(new) < 0.6 * len(alone)
     assert np.mean(new[:, 0] > -0.1) > 0.95
 

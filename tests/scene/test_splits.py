@@ -94,7 +94,7 @@ def test_split_file_may_be_next_to_unprepared_photos(folder, tmp_path_factory):
         (ViewSelection(file="test.txt"), "test.txt: cannot be read"),
         (
             ViewSelection(names=list(LETTERS)),
-            "scene.holdout selects all 24 photos for testing; name fewer",
+            "scene.holdout selects all 24 photos for testing; name fewer photos",
         ),
         (ViewSelection(every=1), "scene.holdout selects all 24 photos"),
     ],
@@ -198,7 +198,7 @@ def test_listed_names_of_missing_photographs_are_skipped(folder, caplog):
         assert letters(read_scene(folder, Split(0, train=choice, missing="skip")), "train") == "ad"
     with pytest.raises(DataError, match="no photo is named 'z'"):
         read_scene(folder, Split(ViewSelection(names=["a", "c", "z"]), missing="skip"))
-    with pytest.raises(DataError, match=r"scene\.holdout selects 0 of .* name photos that are there"):
+    with pytest.raises(DataError, match=r"scene\.holdout selects 0 of .* name photos of the dataset"):
         read_scene(folder, Split(ViewSelection(names=["c"]), missing="skip"))
     with pytest.raises(DataError, match=r"scene\.train leaves no photo"):
         read_scene(folder, Split(0, train=ViewSelection(names=["c"]), missing="skip"))
@@ -234,7 +234,7 @@ def test_dataset_without_images_is_refused(folder):
         ("holdout={offset: 4}", "'offset' needs 'every', as in {every: 8, offset: 4}"),
         ("holdout={every: 8, names: [a]}", "expected a number, {every, offset}"),
         ("holdout={names: [42]}", "expected names of photos as strings: put numbers in quotes, as in '0042'"),
-        ("holdout={names: [a, '']}", "expected names of photos, none of them empty"),
+        ("holdout={names: [a, '']}", "expected names of photos, got an empty name"),
         ("train={names: [1.5]}", "put numbers in quotes, as in '0042', got 1.5"),
         ("validation=best", "or auto, got 'best'"),
         ("missing=ignore", "'refuse' or 'skip'"),

@@ -75,7 +75,7 @@ def compare_views(parts: Parts, missing: Container[Path]) -> ComparisonFacts:
     """
     views = [view for view in parts.views if view.image_path != NO_FILE and view.image_path not in missing]
     if not views:
-        return compare_photos({os.path.relpath(file, parts.path).replace(os.sep, "/"): file for file in parts.on_disk})
+        return compare_photos({os.path.relpath(f, parts.path).replace(os.sep, "/"): f for f in parts.disk_files})
     exposures: list[CameraExposure | None] = [None] * len(views)
     with suppress(DataError):
         exposures = load_exposures(views)
@@ -314,7 +314,7 @@ class Facts:
 
 def measure_dataset(parts: Parts) -> Facts:
     """Return all measurements of a dataset.  parts: as `read_parts` returns them."""
-    views, expected = parts.views, parts.expected
+    views, expected = parts.views, parts.expected_files
     missing = [file for file in expected if not os.path.exists(file)]  # Path.exists may raise
     known_files = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
     names = [view.name for view in views]
@@ -332,15 +332,15 @@ def measure_dataset(parts: Parts) -> Facts:
         registered=len(expected),
         train=len(parts.scene.train) if parts.scene else None,
         test=len(parts.scene.test) if parts.scene else None,
-        on_disk=len(parts.on_disk),
+        on_disk=len(parts.disk_files),
         missing=[_relative_path(file, parts) for file in missing],
-        unregistered=[_relative_path(file, parts) for file in parts.on_disk if file not in known_files],
+        unregistered=[_relative_path(file, parts) for file in parts.disk_files if file not in known_files],
         folders=len({file.parent for file in expected}),
         submodels=parts.submodels,
         cameras=_cameras(parts),
         photos=_photographs(parts, set(missing)),
         comparison=compare_views(parts, set(missing)),
-        capture=None if views else measure_capture(parts.on_disk),
+        capture=None if views else measure_capture(parts.disk_files),
         points=measure_points(parts, extent, centers) if parts.points else None,
         points_per_view=parts.observed if any(parts.observed.values()) else {},
         extent=extent,
@@ -353,7 +353,7 @@ def measure_dataset(parts: Parts) -> Facts:
         same_center=len(views) > 1 and have_same_center(centers),
         same_pose=_equal_groups(names, [(v.time, v.downscale, *_pose(v, extent)) for v in views]),
         same_but_case=[group for group in _equal_groups(names, [n.casefold() for n in names]) if len(set(group)) > 1],
-        left_out=parts.left_out,
+        left_out=parts.warnings,
         hint=parts.hint,
         notes=parts.notes,
         faults=parts.faults,
@@ -442,7 +442,7 @@ def _photographs(parts: Parts, missing: set[Path]) -> PhotographFacts:
 def _add_photograph(facts: PhotographFacts, view: View, name: str, path: Path, file: ImageFile) -> None:
     """Add the faults of a view's photograph or mask to the facts.  name: its name in the facts."""
     camera = view.lens or view.camera
-    if file.cut:
+    if file.is_truncated:
         facts.cut.append(name)
     elif file.size is None:
         facts.unreadable[name] = file.fault.removeprefix(f"{path}: ")
@@ -480,25 +480,25 @@ def read_parts(path: Path) -> Parts:
                 parts.points = parts.points._replace(positions=parts.points.positions - parts.scene.origin)
     if parts.kind == "none":
         _list_photographs(parts)
-    elif parts.image_folder or not parts.expected:
+    elif parts.image_folder or not parts.expected_files:
         folder = parts.image_folder or path / "images"
-        parts.on_disk = list(image_files(folder if folder.is_dir() else path, recursive=True))
+        parts.disk_files = list(image_files(folder if folder.is_dir() else path, recursive=True))
     else:
-        folders = sorted({file.parent for file in parts.expected})
-        parts.on_disk = [file for folder in folders for file in image_files(folder, recursive=False)]
+        folders = sorted({file.parent for file in parts.expected_files})
+        parts.disk_files = [file for folder in folders for file in image_files(folder, recursive=False)]
     if parts.scene:  # list_parts may also list views that belong to no split
-        parts.views = list({view.name: view for view in map(View.whole_photograph, parts.scene.views)}.values())
+        parts.views = list({view.name: view for view in map(View.full_photograph, parts.scene.views)}.values())
     return parts
 
 
 def _list_photographs(parts: Parts) -> None:
     """List the photographs in a folder without cameras, and the warnings that preparing them would log."""
-    parts.on_disk = list(image_files(parts.path, recursive=True))
-    with captured_log(logging.WARNING) as parts.left_out:
+    parts.disk_files = list(image_files(parts.path, recursive=True))
+    with captured_log(logging.WARNING) as parts.warnings:
         try:
             list_photographs(parts.path)
         except DataError as error:
-            if parts.on_disk or parts.left_out:
+            if parts.disk_files or parts.warnings:
                 parts.refusal = str(error)
 
 

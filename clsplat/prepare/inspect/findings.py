@@ -23,7 +23,7 @@ from clsplat.prepare.inspect.facts import (
     read_parts,
 )
 from clsplat.scene.reader import Parts
-from clsplat.scene.scene import position_text
+from clsplat.scene.scene import format_position
 
 TAKE_MORE = "take 30 or more, each from a new position and overlapping the one before by two thirds"
 Level = Literal["error", "warning", "note"]
@@ -362,7 +362,7 @@ def summarize(facts: Facts) -> dict[str, str]:
         if facts.outlier_cameras:
             lines["extent"] += f", without {len(facts.outlier_cameras)} far away from all others"
     if any(facts.origin):
-        lines["origin"] = f"{position_text(np.array(facts.origin))}, which is subtracted from all coordinates"
+        lines["origin"] = f"{format_position(np.array(facts.origin))}, which is subtracted from all coordinates"
     if points := facts.points:
         lines["points"] = f"{points.count:,}"
         if points.error_mean is not None:

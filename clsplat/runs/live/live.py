@@ -13,7 +13,7 @@ from clsplat.core.progress import Progress
 from clsplat.photos.photographs import BACKGROUNDS
 from clsplat.runs.live.preview import RESERVE, Curves, LiveState, Pictures, Preview, PreviewRequest, ShownRun
 from clsplat.runs.live.server import LOOPBACK, Handlers, Server, scene_data
-from clsplat.scene.scene import position_text
+from clsplat.scene.scene import format_position
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.training.run import Run
 from clsplat.training.status import StatusFile
@@ -96,7 +96,7 @@ class Live:
         run_number = state.shown.number + 1 if state.shown else 1
         title, test_views = f"{run.name} · {run.scene_name}", scene.split("test")
         if scene.origin.any():
-            title += f" · origin {position_text(scene.origin)}"
+            title += f" · origin {format_position(scene.origin)}"
         points = run.original.points.positions if run.original.points else np.zeros((0, 3), np.float32)
         viewpoint = Viewpoint.from_points(points, scene.views, (test_views or scene.views)[0])
         page_data = scene_data(run_number, title, scene.views, {view.name for view in test_views}, viewpoint)
