@@ -179,7 +179,7 @@ def check(
 
         _show_findings(result, as_json, lines(result), verdict(result), None if result["whole"] else OutputError)
     elif "model" in result:
-        from clsplat.gaussians.validate import lines as model_lines
+        from clsplat.gaussians.validate import format_report as model_lines
         from clsplat.gaussians.validate import verdict as model_verdict
 
         error = None if result["valid"] else DataError

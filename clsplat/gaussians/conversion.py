@@ -45,7 +45,7 @@ SHARED = ("near", "screen_variance", "background", "alpha")  # rendering paramet
 def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     """Merge all Gaussians into one model, with the first model's rendering parameters and the largest SH degree.
 
-    World filters are baked unless all models have one.  If some models move, the others get a constant motion.
+    World filters are baked unless all models have one.  If some models move, the others get static motion.
     Raises DataError if the models use different screen filters or incompatible motions.
     """
     first = models[0]
@@ -53,9 +53,9 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     if len(models) == 1:
         return first
     for model, name in zip(models, names, strict=True):
-        kinds = [_describe_filter(m) for m in (first, model)]
-        if kinds[0] != kinds[1]:
-            raise DataError(f"{name}: is {kinds[1]}, but {names[0]} is {kinds[0]}; merge only models of the same kind")
+        filters = [_describe_filter(m) for m in (first, model)]
+        if filters[0] != filters[1]:
+            raise DataError(f"{name}: is {filters[1]}, but {names[0]} is {filters[0]}; merge models of one kind")
         values, first_values = model.rendering.comment(), first.rendering.comment()
         different_keys = [key for key in SHARED if values.get(key) != first_values.get(key)]
         if differences := [f"{key} = {values.get(key, 'not set')}" for key in different_keys]:
@@ -163,7 +163,7 @@ def parse_transform(text: str) -> NDArray[np.float64]:
     Rotations are in degrees about x, then y, then z.  A row-major matrix is given as 12 or 16 comma-separated numbers.
     Raises ConfigError.
     """
-    expected = (
+    message = (
         f"--transform {quote(text)}: expected scale=S, rotate=X,Y,Z (degrees), and translate=X,Y,Z separated by "
         "spaces, or the 12 or 16 numbers of a matrix, row by row"
     )
@@ -179,7 +179,7 @@ def parse_transform(text: str) -> NDArray[np.float64]:
                 with np.errstate(over="ignore", invalid="ignore"):  # checked below
                     matrix = _operation_matrix(operation, [float(value) for value in values.split(",")]) @ matrix
     except ValueError as error:
-        raise ConfigError(expected) from error
+        raise ConfigError(message) from error
     linear = matrix[:3, :3]
     if not np.abs(matrix).max() < MAX_NUMBER or not (np.abs(linear).max() or 1) > 1 / MAX_NUMBER:
         raise ConfigError(
@@ -331,22 +331,22 @@ def _restore_on_failure(files: Sequence[Path]) -> Iterator[None]:
 
 
 def _link_or_copy(file: Path, target: Path) -> None:
-    """Link a file, or copy it on a file system without links.  Files are replaced and never changed in place."""
+    """Hard-link a file, or copy it on a file system without hard links.  Files are replaced, never changed in place."""
     try:
         os.link(file, target)
     except OSError:
         shutil.copy2(file, target)
 
 
-def _require_no_other_frames(folder: Path, names: re.Pattern[str], files: Sequence[Path]) -> None:
+def _require_no_other_frames(folder: Path, pattern: re.Pattern[str], files: Sequence[Path]) -> None:
     """Raise ConfigError if a folder has frames of another series, because players would show those frames, too.
 
-    names: the pattern of the frames' names.
+    pattern: matches the frames' names.
     """
     frame_names = {file.name for file in files}
     with raising_output_error(folder):
         all_names = sorted(os.listdir(folder)) if folder.is_dir() else []
-    if other_frames := [name for name in all_names if names.fullmatch(name) and name not in frame_names]:
+    if other_frames := [name for name in all_names if pattern.fullmatch(name) and name not in frame_names]:
         raise ConfigError(
             f"{folder / other_frames[0]}: is not one of the {len(files):,} frames, but named like one; use a new name"
         )
@@ -384,7 +384,7 @@ def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floatin
     means = model.means.astype(np.float64)
     center = np.median(means, axis=0) if center is None else center
     radius = RADIUS * float(np.quantile(np.linalg.norm(means - center, axis=1), QUANTILE))
-    directions = fibonacci(count)
+    directions = fibonacci_sphere(count)
     log_scale = np.log(radius * np.sqrt(4 * np.pi / count) * WIDTH)
     sky_tables: dict[str, NDArray[Any]] = {
         "means": center + radius * directions,
@@ -401,7 +401,7 @@ def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floatin
     return replace(model, **tables, rendering=replace(model.rendering, notes=notes), sky=None)
 
 
-def fibonacci(count: int) -> NDArray[np.float64]:
+def fibonacci_sphere(count: int) -> NDArray[np.float64]:
     """Return evenly distributed unit vectors (a Fibonacci sphere), [count, 3]."""
     index = np.arange(count)
     z = 1 - (2 * index + 1) / count
@@ -441,7 +441,7 @@ def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 
 
 
 def neighbor_distance2(positions: NDArray[np.floating], extent: float) -> NDArray[np.float64]:
-    """Return the exact mean squared distance to the three nearest neighbors, [N] scene units².
+    """Return the mean squared distance to the three nearest neighbors, [N] scene units².
 
     extent: the extent of the scene in scene units, used instead of the distance if there is only one point.
     """

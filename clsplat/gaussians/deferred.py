@@ -20,7 +20,7 @@ from clsplat.opencl.device import Array
 MAX_UPDATES = 32  # deferred at most; then all rows are updated in one pass
 
 
-class Deferred:
+class DeferredHarmonics:
     """The deferred updates of `sh_rest` and its moments.
 
     Code that reads rows outside the current view must call `flush` first, as `Gaussians` does.
@@ -37,10 +37,10 @@ class Deferred:
         self._lanes = int(device.tuning["LANES"])
         self._factors = device.zeros((max_updates, 2))
         self._visible = device.zeros(self._lanes, np.uint32)  # replaces the depth keys of a view, for all blocks
-        self._updates = device.zeros(self._blocks, np.uint32)  # updates applied to each block
+        self._updates = device.zeros(self._block_count, np.uint32)  # updates applied to each block
 
     @property
-    def _blocks(self) -> int:
+    def _block_count(self) -> int:
         return self.gaussians.capacity // self._lanes
 
     def array(self, name: str) -> Array:
@@ -56,7 +56,7 @@ class Deferred:
         """Apply deferred updates of all rows."""
         if self.updates:
             on_host = self.gaussians.on_host
-            for _ in on_host.parts() if on_host else [None]:
+            for _ in on_host.load_parts() if on_host else [None]:
                 self._replay(self._visible, every=0xFFFFFFFF)
             self._updates.fill(0)
             self.updates = 0
@@ -69,8 +69,8 @@ class Deferred:
         if self.updates == self.max_updates or degree != self._degree:
             self.flush()
         self._degree = degree
-        if self._updates.shape != (self._blocks,):  # rearranged since the last flush
-            self._updates = self.gaussians.device.zeros(self._blocks, np.uint32)
+        if self._updates.shape != (self._block_count,):  # rearranged since the last flush
+            self._updates = self.gaussians.device.zeros(self._block_count, np.uint32)
 
     def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
         """Record an update that has already been applied to visible blocks.

@@ -101,14 +101,14 @@ class Gaussians:
             if name in parameters:
                 self.add(name, parameters[name].shape[1])
                 self.set(name, parameters[name])
-        self._rows = device.program("gather.cl")
+        self._gather = device.program("gather.cl")
 
     def __getitem__(self, name: str) -> Array:
         if self.on_host and name in self.on_host:
             raise ConfigError(f"{name} is in host memory; set `rasterizer.harmonics: device`")
-        return self._up_to_date(name).array
+        return self._current_table(name).array
 
-    def _up_to_date(self, name: str) -> Table:
+    def _current_table(self, name: str) -> Table:
         """Apply the deferred updates of a table, and return it."""
         if self.deferred and name in self.deferred.names:
             self.deferred.flush()
@@ -139,7 +139,7 @@ class Gaussians:
 
     def get(self, name: str) -> NDArray[np.float32]:
         """Copy a table to the host, [N, components]."""
-        table = self._up_to_date(name)
+        table = self._current_table(name)
         if self.on_host and name in self.on_host:
             return self.on_host.get(name)
         planes = table.array.get()
@@ -147,7 +147,7 @@ class Gaussians:
 
     def set(self, name: str, values: NDArray[Any]) -> None:
         """Copy values, [N, components], from the host into a table."""
-        table = self._up_to_date(name)
+        table = self._current_table(name)
         if values.shape != (self.count, table.components):
             raise ValueError(f"{name}: expected {(self.count, table.components)}, got {values.shape}")
         if self.on_host and name in self.on_host:
@@ -162,13 +162,13 @@ class Gaussians:
 
         rows: [n] integers, see `check_rows`.  Raises ValueError for invalid rows or shapes.
         """
-        table, rows = self._up_to_date(name), check_rows(rows, self.count)
+        table, rows = self._current_table(name), check_rows(rows, self.count)
         if values.shape != (len(rows), table.components):
             raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
         if self.on_host and name in self.on_host:
             self.on_host.set_rows(name, rows, values)
             return
-        self._rows.set_rows(
+        self._gather.set_rows(
             items=(len(rows), table.components),
             rows=self.device.upload(rows),
             values=self.device.upload(np.ascontiguousarray(values, np.float32)),
@@ -185,11 +185,11 @@ class Gaussians:
         """
         device_rows = self.device.upload(check_rows(rows, self.count))
         for name in names:
-            table = self._up_to_date(name)
+            table = self._current_table(name)
             if self.on_host and name in self.on_host:
                 self.on_host.set_rows(name, rows, np.zeros((len(rows), table.components), np.float32))
                 continue
-            self._rows.zero_rows(
+            self._gather.zero_rows(
                 items=(len(rows), table.components),
                 rows=device_rows,
                 table=table.array,
@@ -232,7 +232,7 @@ class Gaussians:
         source, fresh: [count] uint32; fresh is 1 for new rows.  No other operation changes the number of Gaussians.
         """
         capacity = self.capacity
-        self._up_to_date("sh_rest")
+        self._current_table("sh_rest")
         if count > capacity:
             row_bytes = max(table.components for table in self.tables.values()) * np.dtype(np.float32).itemsize
             grown_capacity = min(int(self.capacity * GROWTH), self.device.info.allocation // row_bytes - ALIGNMENT)
@@ -240,7 +240,7 @@ class Gaussians:
         host_tables = self.on_host.rearrange(source.get()[:count], fresh.get()[:count]) if self.on_host else {}
         for table in (table for name, table in self.tables.items() if name not in host_tables):
             array = self.device.zeros((table.components, capacity))
-            self._rows.gather_rows(
+            self._gather.gather_rows(
                 items=(count, table.components),
                 table=table.array,
                 source=source,

@@ -277,7 +277,7 @@ class Model:
         if not self.origin.any() and np.any(origin) and len(self):
             center = np.median(self.means, axis=0).astype(np.float64)
             if np.linalg.norm(center) < np.linalg.norm(center - origin):
-                LOG.info("the model has no origin; its means are assumed relative to %s", format_position(origin))
+                LOG.info("the model has no origin; its means are assumed to be relative to %s", format_position(origin))
                 return replace(self, origin=origin)
         shift = self.origin - origin
         return replace(self, means=self.means + shift, origin=origin) if shift.any() else self
@@ -359,7 +359,7 @@ class Model:
 
 
 LOG = logging.getLogger("clsplat")
-COARSE = 0.05  # spacing of positions that becomes visible, relative to the median scale
+MAX_SPACING = 0.05  # of positions, relative to the median scale; a larger spacing becomes visible
 
 
 def is_float32_precise(means: NDArray[np.floating], log_scales: Floats) -> bool:
@@ -373,7 +373,7 @@ def is_float32_precise(means: NDArray[np.floating], log_scales: Floats) -> bool:
     if magnitude >= MAX_NUMBER:
         return True
     spacing = np.spacing(np.float32(magnitude))
-    return bool(spacing <= COARSE * np.exp(min(float(np.median(log_scales)), MAX_LOG)))
+    return bool(spacing <= MAX_SPACING * np.exp(min(float(np.median(log_scales)), MAX_LOG)))
 
 
 def load(path: str | Path, options: Reading | None = None) -> Model:
@@ -387,10 +387,10 @@ def load(path: str | Path, options: Reading | None = None) -> Model:
     sky = read_sky_file(model_path(path), file.rendering.get("sky") == "directions" and not (options and options.quiet))
     comment, tables = dict(file.rendering), dict[str, Any](file.parameters)
     origin: NDArray[np.floating] = np.array(comment.pop("origin", np.zeros(3)), np.float64)
-    finite = tables["means"][~not_finite({"means": tables["means"]})]
-    if not origin.any() and not is_float32_precise(finite, tables["log_scales"]):
-        finite = finite.astype(np.float64)
-        origin = far_origin(np.median(finite, axis=0), finite)
+    finite_means = tables["means"][~not_finite({"means": tables["means"]})]
+    if not origin.any() and not is_float32_precise(finite_means, tables["log_scales"]):
+        finite_means = finite_means.astype(np.float64)
+        origin = far_origin(np.median(finite_means, axis=0), finite_means)
         tables["means"] = np.asarray(tables["means"] - origin, np.float32)
     model = Model(**tables, rendering=Rendering.from_comment(comment, file.mode), sky=sky)
     if file.placement is not None:

@@ -66,18 +66,18 @@ def transform_motion(motion: NDArray[np.floating], scale: float, rotation: NDArr
 
 
 def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters]:
-    """Return the tables of several models; if any model moves, the others get a constant motion.
+    """Return the tables of several models; if any model moves, the others get static motion.
 
     Raises DataError if their motions have different columns.
     """
-    by_width = {table[MOTION].shape[1]: name for table, name in zip(tables, names, strict=True) if MOTION in table}
-    if len(by_width) > 1:
-        first, second, *_ = by_width.values()
+    widths = {table[MOTION].shape[1]: name for table, name in zip(tables, names, strict=True) if MOTION in table}
+    if len(widths) > 1:
+        first, second, *_ = widths.values()
         raise DataError(
             f"{second}: its motion differs from {first} in degree or rotation; merge them at one "
             "time (`clsplat convert MODEL OUT --time T`)"
         )
     return [
-        {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *by_width))} if by_width else table
+        {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *widths))} if widths else table
         for table in tables
     ]

@@ -27,7 +27,7 @@ class HostTables:
         self.gaussians, self.device = gaussians, gaussians.device
         self.lanes = int(self.device.tuning["LANES"])
         self.tables: dict[str, NDArray[np.float32]] = {}
-        self.loaded = np.zeros(0, np.int64)  # blocks in the slots, in order
+        self.loaded_blocks = np.zeros(0, np.int64)  # blocks in the slots, in order
         self.slot = self._no_slots()  # slot of each block
         self._slots = 0
         self._downloads: dict[str, Callable[[], NDArray[np.float32]]] = {}  # pending, of changed slots
@@ -36,11 +36,11 @@ class HostTables:
         return name in self.tables
 
     @property
-    def _blocks(self) -> int:
+    def _block_count(self) -> int:
         return -(-self.gaussians.count // self.lanes)
 
     @property
-    def block(self) -> int:
+    def block_size(self) -> int:
         """The number of SH values in a slot."""
         return int(self.tables["sh_rest"].shape[1]) * self.lanes
 
@@ -48,35 +48,35 @@ class HostTables:
         """Add a table of zeros, and return its slots, [slots, components, LANES]."""
         self.finish_download()
         self._forget_slots()
-        self.tables[name] = np.zeros((self._blocks, components, self.lanes), np.float32)
+        self.tables[name] = np.zeros((self._block_count, components, self.lanes), np.float32)
         return self.device.zeros((self._slots, components, self.lanes))
 
     def get(self, name: str) -> NDArray[np.float32]:
         """Return a table, [N, components]."""
         self.finish_download()
         table = self.tables[name]
-        rows = table.transpose(0, 2, 1).reshape(self._blocks * self.lanes, table.shape[1])
+        rows = table.transpose(0, 2, 1).reshape(self._block_count * self.lanes, table.shape[1])
         return np.ascontiguousarray(rows[: self.gaussians.count])
 
     def set(self, name: str, values: NDArray[np.float32]) -> None:
         """Replace the values of a table, [N, components]."""
         self.finish_download()
         self._forget_slots()
-        count, components = values.shape
-        rows = np.zeros((self._blocks * self.lanes, components), np.float32)
+        count, width = values.shape
+        rows = np.zeros((self._block_count * self.lanes, width), np.float32)
         rows[:count] = values
-        self.tables[name] = np.ascontiguousarray(rows.reshape(self._blocks, self.lanes, components).transpose(0, 2, 1))
+        self.tables[name] = np.ascontiguousarray(rows.reshape(self._block_count, self.lanes, width).transpose(0, 2, 1))
 
     def upload_visible(self, depth_key: Array) -> None:
         """Upload the visible blocks, and wait.  depth_key: [S], all bits set for culled Gaussians."""
-        rows = self._blocks * self.lanes
+        rows = self._block_count * self.lanes
         is_visible = (depth_key.get()[:rows] != NO_SLOT).reshape(-1, self.lanes).any(axis=1)
         self.load(np.flatnonzero(is_visible))
 
     def load(self, blocks: NDArray[np.int64]) -> None:
         """Load blocks, given in ascending order, into the slots."""
         self.finish_download()
-        if np.array_equal(blocks, self.loaded):
+        if np.array_equal(blocks, self.loaded_blocks):
             return
         if len(blocks) > self._slots:
             self._slots = max(int(GROWTH * len(blocks)), MIN_ROWS // self.lanes)
@@ -89,23 +89,23 @@ class HostTables:
         slots = np.full(self.slot.shape, NO_SLOT, np.uint32)
         slots[blocks] = np.arange(len(blocks))
         self.slot.set(slots)
-        self.loaded = blocks
+        self.loaded_blocks = blocks
 
     def start_download(self) -> None:
         """Start downloading the slots, after the commands enqueued so far."""
-        self._downloads = {name: self._first_slots(name, len(self.loaded)).get_later() for name in self.tables}
+        self._downloads = {name: self._first_slots(name, len(self.loaded_blocks)).get_later() for name in self.tables}
 
     def finish_download(self) -> None:
         """Wait for the download and write it into the tables."""
         for name, values in self._downloads.items():
-            self.tables[name][self.loaded] = values()
+            self.tables[name][self.loaded_blocks] = values()
         self._downloads = {}
 
-    def parts(self) -> Iterator[None]:
-        """Load all blocks into the slots in parts, and yield after each part; finally restore the previous blocks."""
-        previous_blocks, size = self.loaded, max(self._slots, MIN_ROWS // self.lanes)
-        for first in range(0, self._blocks, size):
-            self.load(np.arange(first, min(first + size, self._blocks)))
+    def load_parts(self) -> Iterator[None]:
+        """Load all blocks into the slots in parts, and yield after each part; then load the previous blocks again."""
+        previous_blocks, size = self.loaded_blocks, max(self._slots, MIN_ROWS // self.lanes)
+        for first in range(0, self._block_count, size):
+            self.load(np.arange(first, min(first + size, self._block_count)))
             yield
         self.load(previous_blocks)
 
@@ -132,13 +132,13 @@ class HostTables:
         return self.device.upload(np.full(max(self.gaussians.capacity // self.lanes, 1), NO_SLOT, np.uint32))
 
     def _forget_slots(self) -> None:
-        self.loaded, self.slot = np.zeros(0, np.int64), self._no_slots()
+        self.loaded_blocks, self.slot = np.zeros(0, np.int64), self._no_slots()
 
 
 def slot_arguments(gaussians: Struct) -> dict[str, Any]:
     """Return the kernel arguments that locate the SH (cl_kernels/slots.h)."""
     if gaussians.on_host:
-        return {"sh_slot": gaussians.on_host.slot, "sh_block": gaussians.on_host.block}
+        return {"sh_slot": gaussians.on_host.slot, "sh_block": gaussians.on_host.block_size}
     return {"sh_slot": gaussians.no_slot, "sh_block": 0}
 
 

@@ -78,9 +78,9 @@ def sample_texels(texels: NDArray[np.floating], directions: NDArray[np.floating]
     """Sample a map, [side * side, C], in directions, [..., 3], by bilinear interpolation; return [..., C]."""
     side = int(np.sqrt(len(texels)))
     position = texel_positions(directions, side)
-    first = np.floor(position).astype(np.int64)
-    values = texels[bilinear_texels(first[..., 0], first[..., 1], side)]
-    return np.asarray(np.einsum("...kc,...k->...c", values, bilinear_weights(position - first)))
+    corner = np.floor(position).astype(np.int64)
+    values = texels[bilinear_texels(corner[..., 0], corner[..., 1], side)]
+    return np.asarray(np.einsum("...kc,...k->...c", values, bilinear_weights(position - corner)))
 
 
 LOG = logging.getLogger("clsplat")
@@ -100,7 +100,7 @@ class DeviceSky:
     texels: Array  # [3, side * side]
     side: int
 
-    def host(self) -> "Sky":
+    def to_host(self) -> "Sky":
         """Copy the map to the host."""
         return Sky(np.ascontiguousarray(self.texels.get().T))
 
@@ -171,14 +171,14 @@ def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
             raise write_error(path, error) from error
 
 
-def read_sky_file(model: Path, expected: bool = False) -> Sky | None:
+def read_sky_file(model: Path, is_expected: bool = False) -> Sky | None:
     """Return the sky of a model file, or None; warn if the sky is missing but expected, or belongs to another model.
 
     Raises DataError if its file is damaged.
     """
     path = sky_path(model)
     if not path.is_file():
-        if expected:
+        if is_expected:
             LOG.warning("%s: was trained with a sky; put %s next to it to render the sky", model, path.name)
         return None
     sky, models = _read(path)

@@ -12,7 +12,7 @@ from clsplat.opencl.device import Array, Device
 
 
 class DeferredUpdates(Protocol):
-    """Deferred Adam updates, as in `Deferred`."""
+    """Deferred Adam updates, as in `DeferredHarmonics`."""
 
     names: ClassVar[tuple[str, ...]]
     updates: int
@@ -61,11 +61,11 @@ class GaussianGradients:
 
     def __init__(self, gaussians: Struct) -> None:
         self.arrays = {name: gaussians.device.zeros(shape) for name, shape in _shapes(gaussians).items()}
-        self._withheld: tuple[str, ...] = ()
+        self._withheld_names: tuple[str, ...] = ()
         self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for densification statistics
 
     def __getitem__(self, name: str) -> Array:
-        if name in self._withheld:
+        if name in self._withheld_names:
             raise ConfigError(
                 f"a penalty on {name} changes Gaussians outside the view, whose updates are deferred; use penalties on "
                 "other parameters, or `update: all` with `rasterizer.harmonics: device`"
@@ -75,7 +75,7 @@ class GaussianGradients:
     def without_deferred(self) -> "GaussianGradients":
         """Return a copy with the same arrays that raises ConfigError on access to arrays with deferred updates."""
         gradients = copy.copy(self)
-        gradients._withheld = ("sh_rest",)
+        gradients._withheld_names = ("sh_rest",)
         return gradients
 
     def replace(self, arrays: dict[str, Array]) -> "GaussianGradients":

@@ -48,12 +48,12 @@ def examine(path: Path) -> dict[str, Any]:
     codec = detect(model_file(path))
     model = load(path, Reading(not_finite="keep"))
     is_nonfinite = not_finite(model.tables())
-    finite = model[~is_nonfinite] if is_nonfinite.any() else model
+    subset = model[~is_nonfinite] if is_nonfinite.any() else model
     fault = f"{int(is_nonfinite.sum()):,} of {len(model):,} Gaussians have values that are not finite"
     findings = [fault] if is_nonfinite.any() else []
-    findings += [message] if (message := too_large_message(finite.tables())) else []
-    findings += _find_activated(finite)
-    lengths = np.linalg.norm(finite.quats.astype(np.float64), axis=1)
+    findings += [message] if (message := too_large_message(subset.tables())) else []
+    findings += _find_activated(subset)
+    lengths = np.linalg.norm(subset.quats.astype(np.float64), axis=1)
     if no_rotation := int((lengths == 0).sum()):
         findings.append(f"{no_rotation} quaternions have length 0")
     if not len(model):
@@ -68,21 +68,21 @@ def examine(path: Path) -> dict[str, Any]:
         "mode": "box" if model.rendering.pixel_box else "mip" if model.rendering.compensate else "default",
         "world_filter": model.filter_variance is not None,
         "moves": model.motion is not None,
-        "ranges": _ranges(finite),
-        "bounds": [finite.means.min(axis=0).tolist(), finite.means.max(axis=0).tolist()] if len(finite) else [],
+        "ranges": _ranges(subset),
+        "bounds": [subset.means.min(axis=0).tolist(), subset.means.max(axis=0).tolist()] if len(subset) else [],
         **({"origin": model.origin.tolist()} if model.origin.any() else {}),
         "degenerate": {
             "not_finite": int(is_nonfinite.sum()),
             "no_rotation": no_rotation,
-            "flat": int((finite.log_scales < np.log(FLAT * typical_size(finite.means))).any(axis=1).sum()),
-            "invisible": int((finite.opacities < FAINT).sum()),
+            "flat": int((subset.log_scales < np.log(FLAT * typical_size(subset.means))).any(axis=1).sum()),
+            "invisible": int((subset.opacities < FAINT).sum()),
         },
         "findings": findings,
         "valid": not findings,
     }
 
 
-def lines(report: dict[str, Any]) -> str:
+def format_report(report: dict[str, Any]) -> str:
     """Format the result of `examine` as lines of text."""
     suffix = (
         " (mip)" * (report["mode"] == "mip") + " (filter_3D)" * report["world_filter"] + " (moves)" * report["moves"]

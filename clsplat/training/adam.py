@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import Decay, NonNegative, Schedule, at_step, divide, explain_schedule
 from clsplat.core.settings import Settings
 from clsplat.formats.splats import MOTION, PARAMETERS, sh_coefficients
-from clsplat.gaussians.deferred import Deferred
+from clsplat.gaussians.deferred import DeferredHarmonics
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.sh_offload import slot_arguments, slot_defines
 from clsplat.gaussians.structs import DeferredUpdates, GaussianGradients, moment_tables
@@ -206,7 +206,7 @@ class Adam:
             return None
         if model.degree == 0 or not rates["sh_rest"]:
             return None
-        gaussians.deferred = gaussians.deferred or Deferred(gaussians)
+        gaussians.deferred = gaussians.deferred or DeferredHarmonics(gaussians)
         gaussians.deferred.prepare(model.degree)
         return gaussians.deferred
 

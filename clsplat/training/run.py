@@ -259,7 +259,7 @@ def host_model(run: Run) -> Model:
     if not tables["filter_variance"].any():
         del tables["filter_variance"]
     rendering = Rendering.from_comment({"version": __version__, **_rendering(run)}, "default")
-    return Model(**tables, rendering=rendering, sky=model.sky.host() if model.sky else None, origin=run.scene.origin)
+    return Model(**tables, rendering=rendering, sky=model.sky.to_host() if model.sky else None, origin=run.scene.origin)
 
 
 def sky_center(run: Run) -> NDArray[np.float64]:

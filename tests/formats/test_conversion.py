@@ -23,7 +23,7 @@ from clsplat.formats.splats import flip_axes, inverse_opacities, opacities
 from clsplat.formats.table import CODECS, detect, model_bytes, read, write
 from clsplat.gaussians.conversion import parse_transform
 from clsplat.gaussians.model import Rendering, load
-from clsplat.gaussians.validate import examine, lines, verdict
+from clsplat.gaussians.validate import examine, format_report, verdict
 from clsplat.viewer.packing import pack
 from tests.support.models import splats
 
@@ -345,7 +345,7 @@ def test_check_describes_a_model(source, tmp_path):
     np.testing.assert_allclose(result["bounds"], [model.means.min(axis=0), model.means.max(axis=0)])
     assert result["valid"]
     assert verdict(result) == f"{tmp_path / 'b.spz'}: valid"
-    assert "SPZ, 100 Gaussians, SH degree 3" in lines(result)
+    assert "SPZ, 100 Gaussians, SH degree 3" in format_report(result)
     json.dumps(result, allow_nan=False)
 
 
@@ -370,8 +370,8 @@ def test_model_size_counts_only_its_files(few_steps, source, tmp_path):
 def test_file_name_is_printed_unchanged(source, tmp_path):
     write(tmp_path / "not_finite_no_rotation.ply", read(source))
     result = clsplat.check(tmp_path / "not_finite_no_rotation.ply")
-    assert lines(result).startswith(f"{tmp_path / 'not_finite_no_rotation.ply'}: PLY")
-    assert "0 not finite, 0 without rotation, 0 flat, " in lines(result)
+    assert format_report(result).startswith(f"{tmp_path / 'not_finite_no_rotation.ply'}: PLY")
+    assert "0 not finite, 0 without rotation, 0 flat, " in format_report(result)
 
 
 def test_check_counts_invisible_gaussians(tmp_path, rng):

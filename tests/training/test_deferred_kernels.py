@@ -6,7 +6,7 @@ import pytest
 from clsplat.conformance.checks.training import check_deferred, put_every_fifth_behind, seen_rows, train
 from clsplat.conformance.scenes import Case, add_world_filter, random_case
 from clsplat.core.errors import ConfigError
-from clsplat.gaussians.deferred import Deferred
+from clsplat.gaussians.deferred import DeferredHarmonics
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Device
@@ -119,7 +119,7 @@ def test_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
     for longest in (1, 2, 7, 32):
         monkeypatch.setattr("clsplat.conformance.checks.training.MAX_DEFERRED", longest)
         results.append(train(device, case.model(device), seen, gradients, "deferred"))
-    for name in Deferred.names:
+    for name in DeferredHarmonics.names:
         for tables in results[1:]:
             np.testing.assert_array_equal(tables[name].view(np.uint32), results[0][name].view(np.uint32))
 

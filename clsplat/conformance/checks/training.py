@@ -13,7 +13,7 @@ from clsplat.conformance.checks.projection import COUNTS as DROPOUT_COUNTS
 from clsplat.conformance.checks.projection import check_gradient, check_record, expected_gradients, project_records
 from clsplat.conformance.scenes import Case, add_world_filter, random_case
 from clsplat.formats.splats import PARAMETERS
-from clsplat.gaussians.deferred import Deferred
+from clsplat.gaussians.deferred import DeferredHarmonics
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, DropoutMask, Gaussians, hide
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import Penalty, PenaltyInputs
@@ -264,7 +264,7 @@ def train(
     gaussians, adam = model.gaussians, Adam(model.gaussians)
     camera = random_case(np.random.default_rng(0), 1).device_camera(device)
     frame = Rasterizer(device, "radix").forward(model, camera, device.upload(BACKGROUND))
-    deferred = gaussians.deferred = Deferred(gaussians, MAX_DEFERRED) if rows == "deferred" else None
+    deferred = gaussians.deferred = DeferredHarmonics(gaussians, MAX_DEFERRED) if rows == "deferred" else None
     for step, (mask, gradient) in enumerate(zip(seen, gradients, strict=True), 1):
         keys = np.full(gaussians.capacity, CULLED, np.uint32)
         keys[: gaussians.count][mask] = 7
@@ -277,7 +277,7 @@ def train(
             deferred.catch_up(view_frame.depth_key)
         excluded = set(gaussians.trained) - {"sh_rest"}
         adam.step(model, view_frame, loss_gradients, Rates().at(step, extent=2.0), excluded, rows)
-    return {name: gaussians.get(name) for name in Deferred.names}
+    return {name: gaussians.get(name) for name in DeferredHarmonics.names}
 
 
 def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Results:
@@ -294,10 +294,10 @@ def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Resu
     immediate = train(device, case.model(device), seen, gradients, "all")
     max_change = max(float(np.abs(values - initial).max(initial=0)), 1e-6)
     yield compare_max("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * max_change / 3e-7)
-    for name, expected, bound in zip(Deferred.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
+    for name, expected, bound in zip(DeferredHarmonics.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
         floor = 0.1 * float(np.abs(expected).max(initial=0))
         yield compare_max("replay_updates", f"{name}, {count} Gaussians", actual[name], expected, bound, floor)
-    for name in Deferred.names:
+    for name in DeferredHarmonics.names:
         bits, expected_bits = actual[name].view(np.uint32), immediate[name].view(np.uint32)
         yield match("note_update", f"bits of {name}, {count} Gaussians", bits, expected_bits)
 
