@@ -57,14 +57,14 @@ def read_compressed_ply(path: Path) -> SplatFile:
     chunks, vertices = _require_match(path, header, tables)
     require_memory(path, len(vertices), MAX_DEGREE if "sh" in tables else 0)
     chunk = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
-    color, alpha = _colors(vertices, chunks, chunk)
+    color, alpha = _decode_colors(vertices, chunks, chunk)
     parameters = {
         "means": _dequantize(_unpack(vertices["packed_position"], BITS), chunks, AXES, chunk).astype(np.float32),
-        "quats": _quaternions(vertices["packed_rotation"]),
+        "quats": _decode_quats(vertices["packed_rotation"]),
         "log_scales": _dequantize(_unpack(vertices["packed_scale"], BITS), chunks, SCALES, chunk).astype(np.float32),
         "logit_opacity": logits(alpha[:, None]),
         "sh_base": ((color - 0.5) / SH_C0).astype(np.float32),
-        "sh_rest": _harmonics(path, tables.get("sh"), len(vertices)),
+        "sh_rest": _decode_harmonics(path, tables.get("sh"), len(vertices)),
     }
     return SplatFile(parameters, read_rendering_comment(path, header), render_mode(header))
 
@@ -83,7 +83,7 @@ def _require_match(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]
     return chunks, vertices
 
 
-def _harmonics(path: Path, table: NDArray[Any] | None, count: int) -> NDArray[np.float32]:
+def _decode_harmonics(path: Path, table: NDArray[Any] | None, count: int) -> NDArray[np.float32]:
     """Return the SH coefficients above band 0, coefficient-major, [count, 3(K-1)].  Raises DataError."""
     if table is None:
         return np.zeros((count, 0), np.float32)
@@ -111,25 +111,25 @@ def _unpack(packed: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _dequantize(
-    fractions: NDArray[np.float64], chunks: NDArray[Any], names: tuple[str, ...], chunk: NDArray[np.integer]
+    fractions: NDArray[np.float64], chunks: NDArray[Any], names: tuple[str, ...], chunk_index: NDArray[np.integer]
 ) -> NDArray[np.float64]:
-    """Scale fractions in [0, 1] to the range of each splat's chunk, [N, columns].  chunk: [N]."""
+    """Scale fractions in [0, 1] to the range of each splat's chunk, [N, columns].  chunk_index: [N]."""
     low, high = (np.stack([chunks[f"{b}_{n}"] for n in names], axis=1).astype(np.float64) for b in ("min", "max"))
-    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused later
-        values: NDArray[np.float64] = low[chunk] + fractions * (high - low)[chunk]
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are rejected later
+        values: NDArray[np.float64] = low[chunk_index] + fractions * (high - low)[chunk_index]
     return values
 
 
-def _colors(
-    vertices: NDArray[Any], chunks: NDArray[Any], chunk: NDArray[np.integer]
+def _decode_colors(
+    vertices: NDArray[Any], chunks: NDArray[Any], chunk_index: NDArray[np.integer]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the colors, [N, 3], and opacities, [N]."""
     fractions = _unpack(vertices["packed_color"], (8, 8, 8, 8))
     if set(_BOUNDS[12:]) <= set(chunks.dtype.names or ()):
-        return _dequantize(fractions[:, :3], chunks, COLORS, chunk), fractions[:, 3]
+        return _dequantize(fractions[:, :3], chunks, COLORS, chunk_index), fractions[:, 3]
     return fractions[:, :3], fractions[:, 3]
 
 
-def _quaternions(packed: NDArray[Any]) -> NDArray[np.float32]:
+def _decode_quats(packed: NDArray[Any]) -> NDArray[np.float32]:
     fractions = _unpack(packed << np.uint32(2), (10, 10, 10))
     return from_smallest_three((packed >> np.uint32(30)).astype(np.intp), (fractions - 0.5) * 2**0.5)

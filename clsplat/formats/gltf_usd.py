@@ -24,7 +24,7 @@ from clsplat.core.files import is_inside
 from clsplat.core.harmonics import map_colors
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file, read_json
-from clsplat.formats.packing import Output, open_hashed
+from clsplat.formats.packing import HashedFile, open_hashed
 from clsplat.formats.ply import read_extras
 from clsplat.formats.splats import (
     FLIP,
@@ -44,7 +44,7 @@ from clsplat.formats.splats import (
     transform,
     unit,
 )
-from clsplat.formats.spz import MIN_LIMIT, RATIO, decode_spz
+from clsplat.formats.spz import MAX_RATIO, MIN_LIMIT, decode_spz
 
 # The parts of glTF with Gaussians: primitives, the transforms of their nodes, and accessors.
 
@@ -76,7 +76,7 @@ class Gltf:
         self.is_mip = False
         if unknown := [name for name in tree.get("extensionsRequired", []) if not SUPPORTED.fullmatch(name)]:
             names = first_few(list(map(quote, unknown)))
-            raise DataError(f"{path}: requires {names}, which clsplat cannot read; export it again without them")
+            raise DataError(f"{path}: requires {names}, which clsplat does not support; export it again without them")
         pairs = [(part, matrix) for mesh, matrix in self._meshes() for part in tree["meshes"][mesh]["primitives"]]
         self.primitives = [pair for pair in pairs if _has_gaussians(_extensions(pair[0]))]
         if not self.primitives:
@@ -104,16 +104,16 @@ class Gltf:
     def _read_primitive(self, primitive: dict[str, Any]) -> Parameters:
         """Return the Gaussians of one primitive, in the axes of glTF."""
         extensions = _extensions(primitive)
-        extension, names = extensions.get(EXTENSION, {}), primitive["attributes"]
+        extension, attributes = extensions.get(EXTENSION, {}), primitive["attributes"]
         kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", SRGB)
         if kernel != "ellipse":
             raise DataError(f"{self.path}: its kernel is {quote(kernel)}; expected 'ellipse'; export it again")
         if (view := _spz_view(extensions)) is not None:
-            part = self._read_spz(view, names)
+            part = self._read_spz(view, attributes)
         elif compressions := [name for name in extension.get("extensions", {}) if "compression" in name]:
             raise DataError(f"{self.path}: is compressed with {quote(compressions[0])}; export it without compression")
         else:
-            part = self._attributes(names)
+            part = self._read_attributes(attributes)
         if space == LINEAR:
             self.notes.add("its colors are linear: they are converted to sRGB, exactly where they have no harmonics")
             bands = np.concatenate([part["sh_base"], part["sh_rest"]], axis=1)
@@ -123,37 +123,37 @@ class Gltf:
             self.notes.add(f"its colors are {quote(space)}; they are used unchanged")
         return part
 
-    def _read_spz(self, view: Any, names: dict[str, Any]) -> Parameters:
+    def _read_spz(self, view: Any, attributes: dict[str, Any]) -> Parameters:
         """Return the Gaussians of an SPZ file in a buffer view, in the axes of glTF.
 
         The data should use the axes x left, y up, z front, but some programs keep the axes of SPZ.  The axes that fit
         the declared bounds best are assumed.
         """
-        data, start, length, _ = self._view(view)
+        data, start, length, _ = self._buffer_view(view)
         splats, _ = decode_spz(self.path, data[start : start + length])
         self.is_mip |= splats.mode == "mip"
         self.spz_bytes += sum(table.nbytes for table in splats.parameters.values())
-        if self.spz_bytes > 4 * max(RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # as much as a single SPZ
+        if self.spz_bytes > 4 * max(MAX_RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # as for a single SPZ
             raise DataError(
                 f"{self.path}: its SPZ data decompresses to {self.spz_bytes} bytes, too many; export it again"
             )
         part, axes = splats.parameters, [LEFT_UP_FRONT, FLIP]
-        position = self.tree["accessors"][_index(names["POSITION"])] if "POSITION" in names else {}
+        position = self.tree["accessors"][_index(attributes["POSITION"])] if "POSITION" in attributes else {}
         if len(splats) and {"min", "max"} <= position.keys():
             bounds = [part["means"].min(axis=0), part["means"].max(axis=0)]
             declared = np.array([position["min"], position["max"]], np.float64)
             axes.sort(key=lambda signs: float(np.abs(np.sort(bounds * np.array(signs), axis=0) - declared).sum()))
         return flip_axes(part, axes[0])
 
-    def _attributes(self, names: dict[str, Any]) -> Parameters:
+    def _read_attributes(self, attributes: dict[str, Any]) -> Parameters:
         """Return the Gaussians stored in the attributes of a primitive, in the axes of glTF."""
 
         def table(name: str, width: int) -> NDArray[np.float32]:
-            if name not in names:
+            if name not in attributes:
                 raise DataError(f"{self.path}: its Gaussians have no attribute {name}; export the file again")
-            return self.accessor(names[name], width)
+            return self.accessor(attributes[name], width)
 
-        degree = max((d for d in range(MAX_DEGREE + 1) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in names), default=0)
+        degree = max((d for d in range(MAX_DEGREE + 1) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in attributes), default=0)
         bands = [table(name, 3) for name in _sh_names(degree)]
         means = table("POSITION", 3)
         parameters = {
@@ -168,39 +168,39 @@ class Gltf:
             raise DataError(f"{self.path}: the attributes of its Gaussians have different counts; export it again")
         return parameters
 
-    def accessor(self, number: Any, width: int) -> NDArray[np.float32]:
+    def accessor(self, index: Any, width: int) -> NDArray[np.float32]:
         """Return the rows of an accessor, [count, width].  Normalized integers are scaled to [-1, 1]."""
-        row = self.tree["accessors"][_index(number)]
-        kind, count, start = COMPONENTS[row["componentType"]], _index(row["count"]), _index(row.get("byteOffset", 0))
+        row = self.tree["accessors"][_index(index)]
+        dtype, count, start = COMPONENTS[row["componentType"]], _index(row["count"]), _index(row.get("byteOffset", 0))
         if WIDTHS.get(row["type"]) != width or "sparse" in row or "bufferView" not in row:
             raise DataError(
-                f"{self.path}: accessor {number} has type {quote(row['type'])}, and may be sparse or without data; "
+                f"{self.path}: accessor {index} has type {quote(row['type'])}, is sparse, or has no data; "
                 f"expected {width} numbers per row in a buffer; export it again without compression"
             )
-        size = width * np.dtype(kind).itemsize
-        data, offset, length, stride = self._view(row["bufferView"], size)
+        size = width * np.dtype(dtype).itemsize
+        data, offset, length, stride = self._buffer_view(row["bufferView"], size)
         if stride < size:
             raise DataError(
-                f"{self.path}: the rows of accessor {number} are {stride} bytes apart; expected at least {size}; "
+                f"{self.path}: the rows of accessor {index} are {stride} bytes apart; expected at least {size}; "
                 "export it again"
             )
         if start + stride * max(count - 1, 0) + size * min(count, 1) > length:
             raise DataError(
-                f"{self.path}: accessor {number} has {count} rows, more than fit into its view of {length} bytes; "
+                f"{self.path}: accessor {index} has {count} rows, more than fit into its view of {length} bytes; "
                 "copy or export it again"
             )
         self.bytes_left -= count * size
         if self.bytes_left < 0:
             raise DataError(f"{self.path}: its accessors share too much data; export it again")
         require_memory(self.path, count, 0)
-        rows = np.ndarray((count, width), kind, data, start + offset, (stride, np.dtype(kind).itemsize))
-        if not row.get("normalized") or kind == "<f4":
+        rows = np.ndarray((count, width), dtype, data, start + offset, (stride, np.dtype(dtype).itemsize))
+        if not row.get("normalized") or dtype == "<f4":
             return rows.astype(np.float32)
-        return np.maximum(rows / np.float32(np.iinfo(kind).max), -1).astype(np.float32)
+        return np.maximum(rows / np.float32(np.iinfo(dtype).max), -1).astype(np.float32)
 
-    def _view(self, number: Any, stride: int = 0) -> tuple[bytes, int, int, int]:
+    def _buffer_view(self, index: Any, stride: int = 0) -> tuple[bytes, int, int, int]:
         """Return a buffer, and the offset, length, and stride in bytes of a view in it.  stride: the default stride."""
-        view = self.tree["bufferViews"][_index(number)]
+        view = self.tree["bufferViews"][_index(index)]
         if compressions := [name for name in view.get("extensions", {}) if "compression" in name]:
             raise DataError(f"{self.path}: is compressed with {quote(compressions[0])}; export it without compression")
         buffer = self.tree["buffers"][_index(view["buffer"])]
@@ -209,30 +209,30 @@ class Gltf:
         size = min(_index(buffer["byteLength"]), len(data))
         if offset + length > size:
             raise DataError(
-                f"{self.path}: view {number} has {length} bytes at {offset}, more than its buffer of {size} bytes; "
+                f"{self.path}: view {index} has {length} bytes at {offset}, more than its buffer of {size} bytes; "
                 "copy or export it again"
             )
         return data, offset, length, _index(view.get("byteStride", stride))
 
-    def _content(self, uri: Any, number: int) -> bytes:
+    def _content(self, uri: Any, index: int) -> bytes:
         """Return the bytes of a buffer, from the GLB itself, a data URI, or a file in the same folder."""
-        if uri in self.files and (uri or not number):
+        if uri in self.files and (uri or not index):
             return self.files[uri]
         data = None
         if isinstance(uri, str) and re.match("https?://", uri):
             raise DataError(
-                f"{self.path}: buffer {number} is at {quote(uri)}, and clsplat does not read from the web; download it "
+                f"{self.path}: buffer {index} is at {quote(uri)}, and clsplat does not read from the web; download it "
                 "into the folder of the file, and change its uri to the file name"
             )
         if uri is None:
-            data = None if number else self.binary
+            data = None if index else self.binary
         elif uri.startswith("data:"):
             data = base64.b64decode(uri.partition(",")[2]) if ";base64," in uri[:MAX_NAME] else None
         elif len(uri) < MAX_NAME and is_inside(name := unquote(uri)):
             data = read_file(self.path.parent / name, f"a buffer of {self.path.name}", limit=MAX_FILE)
         if data is None:
             raise DataError(
-                f"{self.path}: buffer {number} is {quote(uri)}; expected data in the file, or a file in its folder; "
+                f"{self.path}: buffer {index} is {quote(uri)}; expected data in the file, or a file in its folder; "
                 "export it again"
             )
         self.files[uri] = data
@@ -246,28 +246,28 @@ class Gltf:
         visited_nodes: set[int] = set()
         pending = [(_index(root), np.eye(4)) for root in self._roots()]
         while pending:
-            number, parent_matrix = pending.pop()
-            if number in visited_nodes:
-                raise DataError(f"{self.path}: its nodes are not a tree: node {number} occurs twice; export it again")
-            visited_nodes.add(number)
-            matrix = parent_matrix @ self._matrix(number)
+            index, parent_matrix = pending.pop()
+            if index in visited_nodes:
+                raise DataError(f"{self.path}: its nodes are not a tree: node {index} occurs twice; export it again")
+            visited_nodes.add(index)
+            matrix = parent_matrix @ self._matrix(index)
             if not np.isfinite(matrix).all():
-                raise DataError(f"{self.path}: node {number} has no finite transform; export it again")
-            if "mesh" in nodes[number]:
-                meshes.append((_index(nodes[number]["mesh"]), matrix))
-            pending += [(_index(child), matrix) for child in nodes[number].get("children", [])]
+                raise DataError(f"{self.path}: node {index} has no finite transform; export it again")
+            if "mesh" in nodes[index]:
+                meshes.append((_index(nodes[index]["mesh"]), matrix))
+            pending += [(_index(child), matrix) for child in nodes[index].get("children", [])]
         return meshes
 
-    def _matrix(self, number: int) -> NDArray[np.float64]:
+    def _matrix(self, index: int) -> NDArray[np.float64]:
         """Return the transform of a node, [4, 4].  Raises DataError for a quaternion without a direction."""
-        node = self.tree["nodes"][number]
+        node = self.tree["nodes"][index]
         if "matrix" in node:
             return np.array(node["matrix"], np.float64).reshape(4, 4).T
         quaternion = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
         length = np.linalg.norm(quaternion)
         if not 0 < length < np.inf:
             raise DataError(
-                f"{self.path}: the rotation of node {number} is a quaternion of length {length:g}; expected 1; export "
+                f"{self.path}: the rotation of node {index} is a quaternion of length {length:g}; expected 1; export "
                 "it again"
             )
         x, y, z, w = quaternion / length
@@ -344,7 +344,7 @@ def read_gltf(path: Path) -> SplatFile:
     """Read the Gaussians of a .glb or .gltf file.  Raises DataError if it is missing, damaged, or has none."""
     data = read_file(path, "a .glb or .gltf file", limit=MAX_FILE)
     is_text = not data.startswith(MAGIC) and (path.suffix.lower() == ".gltf" or data.lstrip()[:1] == b"{")
-    text, binary = (data, None) if is_text else _chunks(path, data)
+    text, binary = (data, None) if is_text else _read_chunks(path, data)
     if len(text) > (limit := MAX_TEXT if is_text else MAX_JSON):
         raise DataError(f"{path}: its JSON has {len(text)} bytes; expected at most {limit}; export fewer primitives")
     try:
@@ -370,7 +370,7 @@ def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
     """Write Gaussians as one primitive; return the SHA-256 of the file.  Raises OutputError."""
     require_gaussians(path, splats)
     p = flip_axes(splats.parameters)
-    attributes = _attributes(p)
+    attributes = _make_attributes(p)
     views: list[Any] = []
     accessors: list[Any] = []
     blocks, start = [], 0
@@ -421,7 +421,7 @@ def _origin(splats: SplatFile) -> list[float] | None:
     return origin and (np.array(FLIP) * origin).tolist()
 
 
-def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
+def _make_attributes(p: Parameters) -> dict[str, NDArray[Any]]:
     """Return the glTF attributes by name, [N, components] float32 or uint8."""
     alpha = opacities(p["logit_opacity"])
     color = np.clip(SH_C0 * p["sh_base"].astype(np.float64) + 0.5, 0, 1)
@@ -441,17 +441,17 @@ def _attributes(p: Parameters) -> dict[str, NDArray[Any]]:
     return attributes
 
 
-def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
+def _read_chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
     """Return the JSON and the binary chunk of a .glb file.  Raises DataError."""
     chunks: dict[int, bytes] = {}
     start = 12
     if data[:4] != MAGIC or len(data) < 20 or data[4:8] != b"\2\0\0\0":
         raise DataError(f"{path}: not a .glb file of glTF 2.0; copy or export it again")
     while start + 8 <= len(data):
-        length, kind = struct.unpack_from("<2I", data, start)
+        length, chunk_type = struct.unpack_from("<2I", data, start)
         if length > len(data) - start - 8:
             raise DataError(f"{path}: has {len(data)} bytes, but its chunks are longer; copy or export it again")
-        chunks.setdefault(kind, data[start + 8 : start + 8 + length])
+        chunks.setdefault(chunk_type, data[start + 8 : start + 8 + length])
         start += 8 + length
     text = chunks.get(JSON, b"")
     if not text:
@@ -463,7 +463,7 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
 
 BLOCK = 4096  # rows formatted at once
 EXTENT = 3.0  # standard deviations around the means
-START = """#usda 1.0
+USDA_HEADER = """#usda 1.0
 (
     defaultPrim = "Gaussians"
     metersPerUnit = 1
@@ -494,18 +494,18 @@ def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
         "float3[] radiance:sphericalHarmonicsCoefficients": harmonics,
     }
     with open_hashed(path) as file:
-        file.write(START.encode())
+        file.write(USDA_HEADER.encode())
         file.write(f"    uniform int radiance:sphericalHarmonicsDegree = {splats.sh_degree}\n".encode())
         if origin := _origin(splats):
             file.write(f"    double3 xformOp:translate = {tuple(origin)}\n".encode())
             file.write(b'    uniform token[] xformOpOrder = ["xformOp:translate"]\n')
         for name, table in tables.items():
-            _array(file, name, table)
+            _write_array(file, name, table)
         file.write(b"}\n")
     return file.sha256
 
 
-def _array(file: Output, name: str, table: NDArray[np.floating]) -> None:
+def _write_array(file: HashedFile, name: str, table: NDArray[np.floating]) -> None:
     """Write one attribute with the full precision of float32."""
     width = table.shape[1]
     row = ", ".join(["%.9g"] * width) if width == 1 else f"({', '.join(['%.9g'] * width)})"

@@ -26,18 +26,18 @@ def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
 
     Signs are chosen so that the largest is positive.
     """
-    largest = np.argmax(np.abs(quats), axis=1)
+    largest_index = np.argmax(np.abs(quats), axis=1)
     rows = np.arange(len(quats))
-    positive = np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None] * quats
-    return largest, positive[rows[:, None], _SMALLEST[largest]]
+    flipped_quats = np.where(quats[rows, largest_index] < 0, -1.0, 1.0)[:, None] * quats
+    return largest_index, flipped_quats[rows[:, None], _SMALLEST[largest_index]]
 
 
-def from_smallest_three(largest: NDArray[np.integer], smallest: NDArray[np.floating]) -> NDArray[np.float32]:
+def from_smallest_three(largest_index: NDArray[np.integer], smallest: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return unit quaternions [N, 4] from the result of `smallest_three`."""
     quats = np.empty((len(smallest), 4))
     rows = np.arange(len(smallest))
-    quats[rows[:, None], _SMALLEST[largest]] = smallest
-    quats[rows, largest] = np.sqrt(np.maximum(1 - np.square(smallest).sum(axis=1), 0))
+    quats[rows[:, None], _SMALLEST[largest_index]] = smallest
+    quats[rows, largest_index] = np.sqrt(np.maximum(1 - np.square(smallest).sum(axis=1), 0))
     return quats.astype(np.float32)
 
 
@@ -61,7 +61,7 @@ def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return values
 
 
-def outside_bytes(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
+def exceeds_byte(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask, with the shape of `levels`, of the levels that do not round to a value of a byte."""
     return (levels < -0.5) | (levels > 255.5)
 
@@ -79,7 +79,7 @@ MAX_SIDE = 16383  # px, the limit of WebP
 BGRA = [2, 1, 0, 3]
 
 
-def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
+def encode_webp(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
     """Encode pixels, [n, 4] RGBA, row by row as an image padded with zeros; alpha must be at least 1.
 
     WebP drops colors where alpha is 0, so the image is decoded to verify it.  Raises OutputError if it differs.
@@ -90,24 +90,24 @@ def encode(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
     image[: len(pixels)] = pixels
     bgra = np.ascontiguousarray(image[:, BGRA].reshape(height, width, 4))
     is_encoded, data = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, LOSSLESS])
-    if not is_encoded or not np.array_equal(_rgba(data), image):
+    if not is_encoded or not np.array_equal(_decode_rgba(data), image):
         raise OutputError(f"{path}: OpenCV {cv2.__version__} cannot write lossless WebP here; install another version")
     return bytes(data.tobytes())
 
 
-def decode(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int) -> NDArray[np.uint8]:
+def decode_webp(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int) -> NDArray[np.uint8]:
     """Decode the pixels of an image, [n, 4] RGBA, row by row, with `min_pixels` <= n <= `max_pixels`.
 
     Raises DataError for another format, and, before decoding, for another size.
     """
-    width, height = size(path, name, data)
+    width, height = webp_size(path, name, data)
     if not min_pixels <= width * height <= max_pixels:
         raise DataError(
             f"{path}: {name} has {width} x {height} px; expected {min_pixels} to {max_pixels} px in total; "
             "export the file again"
         )
     try:
-        pixels = _rgba(np.frombuffer(data, np.uint8))
+        pixels = _decode_rgba(np.frombuffer(data, np.uint8))
     except (cv2.error, ValueError):
         pixels = np.zeros((0, 4), np.uint8)
     if len(pixels) != width * height:
@@ -115,7 +115,7 @@ def decode(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int)
     return pixels
 
 
-def _rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _decode_rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Decode pixels, [n, 4].  An image without an alpha channel gets an alpha of 255."""
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8 or image.ndim != 3:
@@ -125,37 +125,37 @@ def _rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image.reshape(-1, 4)[:, BGRA])
 
 
-def size(path: Path, name: str, data: bytes) -> tuple[int, int]:
+def webp_size(path: Path, name: str, data: bytes) -> tuple[int, int]:
     """Return the width and height, px, from the header of an image.  Raises DataError for another format."""
-    kind = data[12:16]
+    chunk_type = data[12:16]
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
-        if kind == b"VP8L":
+        if chunk_type == b"VP8L":
             bits = struct.unpack_from("<I", data, 21)[0]
             return (bits & 16383) + 1, (bits >> 14 & 16383) + 1
-        if kind == b"VP8X":
+        if chunk_type == b"VP8X":
             sides = (int.from_bytes(data[offset : offset + 3], "little") + 1 for offset in (24, 27))
             return next(sides), next(sides)
     raise DataError(f"{path}: {name} is not a lossless WebP image; export the file again")
 
 
-# Output files that compute their SHA-256.
+# Files that are hashed while they are written.
 
 
-class Output:
+class HashedFile:
     """A file that is written from start to end, and the SHA-256 of its bytes."""
 
     def __init__(self, file: BinaryIO) -> None:
-        self._file, self._sum = file, hashlib.sha256()
+        self._file, self._hash = file, hashlib.sha256()
 
     def write(self, data: bytes) -> None:
         """Append bytes to the file."""
         self._file.write(data)
-        self._sum.update(data)
+        self._hash.update(data)
 
     @property
     def sha256(self) -> str:
         """The SHA-256 of the bytes written so far, as `sha256sum` prints it."""
-        return self._sum.hexdigest()
+        return self._hash.hexdigest()
 
 
 def write_bytes(path: Path, data: bytes) -> str:
@@ -166,7 +166,7 @@ def write_bytes(path: Path, data: bytes) -> str:
 
 
 @contextmanager
-def open_hashed(path: Path) -> Iterator[Output]:
+def open_hashed(path: Path) -> Iterator[HashedFile]:
     """Open a file for atomic writing, like `open_atomic`, and hash the written bytes.  Raises OutputError."""
     with open_atomic(path) as file:
-        yield Output(file)
+        yield HashedFile(file)

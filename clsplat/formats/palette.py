@@ -15,7 +15,7 @@ LEVELS = 511  # integers on each side of 0; sums of 45 products stay below 2^24
 TAIL = 1e-4  # fraction of values that may be clipped to LEVELS
 
 
-def codebook(values: NDArray[np.floating], step: float | None = None) -> NDArray[np.float64]:
+def fit_codebook(values: NDArray[np.floating], step: float | None = None) -> NDArray[np.float64]:
     """Return a codebook, [ENTRIES] in ascending order, that approximates `values` with a small squared error.
 
     If there are at most ENTRIES distinct values, these are returned exactly, and the last one is repeated.  Otherwise,
@@ -95,33 +95,33 @@ def nearest_entries(values: NDArray[np.floating], entries: NDArray[np.float64]) 
     return np.searchsorted((entries[1:] + entries[:-1]) / 2, values).astype(np.uint8)
 
 
-def palette(
-    points: NDArray[np.float32], entries: int, weights: NDArray[np.float64]
+def fit_palette(
+    points: NDArray[np.float32], entry_count: int, weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return at most `entries` vectors, [E, c], that approximate points [N, c], and the label of each point, [N].
+    """Return at most `entry_count` vectors, [E, c], that approximate points [N, c], and the label of each point, [N].
 
-    If there are at most `entries` distinct points, these are returned exactly.  Otherwise, Lloyd's iteration runs on a
-    sample of the points, and starts from evenly spaced ones.  A vector without points moves to the point with the
+    If there are at most `entry_count` distinct points, these are returned exactly.  Otherwise, Lloyd's iteration runs
+    on a sample of the points, and starts from evenly spaced ones.  A vector without points moves to the point with the
     largest error.  Points have at most 45 components.  weights: relative probabilities of sampling each point, [N].
     """
-    if (exact_palette := unique_points(points, entries)) is not None:
+    if (exact_palette := unique_points(points, entry_count)) is not None:
         return exact_palette
     integers = _to_integers(points)
-    rows = _sample_rows(len(points), SAMPLE * entries, weights)
+    rows = _sample_rows(len(points), SAMPLE * entry_count, weights)
     sample, integer_sample = points[rows].astype(np.float64), integers[rows]
-    starts = np.linspace(0, len(sample) - 1, entries).astype(np.int64)
+    starts = np.linspace(0, len(sample) - 1, entry_count).astype(np.int64)
     vectors, centers = sample[starts], integer_sample[starts]
     for _ in range(PALETTE_ROUNDS):
         labels, distance = _nearest_vectors(integer_sample, centers)
-        counts = np.bincount(labels, minlength=entries)
-        sums = [np.bincount(labels, column, minlength=entries) for column in integer_sample.T]
+        counts = np.bincount(labels, minlength=entry_count)
+        sums = [np.bincount(labels, column, minlength=entry_count) for column in integer_sample.T]
         centers = np.rint(np.stack(sums, axis=1) / np.maximum(counts, 1)[:, None]).astype(np.float32)
-        empty = np.flatnonzero(counts == 0)
-        farthest = np.argsort(-distance, kind="stable")[: len(empty)]
-        centers[empty] = integer_sample[farthest]
+        empty_entries = np.flatnonzero(counts == 0)
+        farthest = np.argsort(-distance, kind="stable")[: len(empty_entries)]
+        centers[empty_entries] = integer_sample[farthest]
     for column in range(points.shape[1]):
-        vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entries) / np.maximum(counts, 1)
-    vectors[empty] = sample[farthest]
+        vectors[:, column] = np.bincount(labels, sample[:, column], minlength=entry_count) / np.maximum(counts, 1)
+    vectors[empty_entries] = sample[farthest]
     return vectors, _nearest_vectors(integers, centers)[0]
 
 
@@ -153,24 +153,24 @@ def _sample_rows(count: int, max_rows: int, weights: NDArray[np.float64]) -> NDA
     max_rows = min(count, max_rows)
     if not weights.any():
         return np.linspace(0, count - 1, max_rows).astype(np.int64)
-    total = np.cumsum(weights)
-    return np.asarray(np.searchsorted(total, (np.arange(max_rows) + 0.5) / max_rows * total[-1]))
+    cumulative = np.cumsum(weights)
+    return np.asarray(np.searchsorted(cumulative, (np.arange(max_rows) + 0.5) / max_rows * cumulative[-1]))
 
 
 def _to_integers(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Scale and round values to integers from -LEVELS to LEVELS."""
-    largest = robust_max(values) or np.float32(1)
-    return np.asarray(np.rint(np.clip(values / largest, -1, 1) * np.float32(LEVELS)))
+    max_value = robust_max(values) or np.float32(1)
+    return np.asarray(np.rint(np.clip(values / max_value, -1, 1) * np.float32(LEVELS)))
 
 
 def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
     """Return the distinct points in order of appearance and the label of each point; None if more than `max_points`."""
     if len(np.unique(points[:, 0])) > max_points:  # a fast test that suffices for most models
         return None
-    unique_rows, first, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    unique_rows, first_rows, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)
     if len(unique_rows) > max_points:
         return None
-    order = np.argsort(first)
+    order = np.argsort(first_rows)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     return unique_rows[order].astype(np.float64), rank[labels.reshape(-1)]
@@ -178,6 +178,6 @@ def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray
 
 def robust_max(values: NDArray[np.float32]) -> np.float32:
     """Return the quantile 1 - TAIL of the absolute values, or 0 if there are no values."""
-    sizes = np.abs(values).ravel()
-    index = min(int((1 - TAIL) * sizes.size), sizes.size - 1)
-    return np.float32(np.partition(sizes, index)[index] if sizes.size else 0)
+    magnitudes = np.abs(values).ravel()
+    index = min(int((1 - TAIL) * magnitudes.size), magnitudes.size - 1)
+    return np.float32(np.partition(magnitudes, index)[index] if magnitudes.size else 0)

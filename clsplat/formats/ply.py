@@ -29,9 +29,9 @@ from clsplat.formats.splats import (
     FLAT_LOG_SCALE,
     FLATNESS,
     MAX_DEGREE,
+    MAX_STORED_DEGREE,
     MOTION,
     PARAMETERS,
-    STORED_DEGREE,
     Parameters,
     SplatFile,
     find_motion_columns,
@@ -104,17 +104,17 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
             f"{path}: not a PLY file; expected a header from 'ply' to 'end_header' in its first {MAX_HEADER} bytes; "
             "copy or export it again"
         )
-    form = ""
+    encoding = ""
     elements: list[_Element] = []
     comments = []
     for number, line in enumerate(data[: end.start()].decode("utf-8", "replace").split("\n"), start=1):
         match line.split():
-            case ["format", name, _] if name in ORDERS and not form:
-                form = name
+            case ["format", name, _] if name in ORDERS and not encoding:
+                encoding = name
             case ["element", name, count] if COUNT.fullmatch(count):
                 elements.append(_Element(name, int(count), []))
-            case ["property", kind, name] if kind in TYPES and elements:
-                elements[-1].properties.append((name, TYPES[kind]))
+            case ["property", type_name, name] if type_name in TYPES and elements:
+                elements[-1].properties.append((name, TYPES[type_name]))
             case ["property", "list", _, _, _] if elements and elements[-1].name != "vertex":
                 elements[-1].has_list = True
             case ["comment", *_]:
@@ -126,9 +126,9 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
                     f"{path}: line {number}: cannot read {quote(line.strip())}; expected a PLY header whose vertex "
                     "properties are scalars: export it again"
                 )
-    if not form:
+    if not encoding:
         raise DataError(f"{path}: the PLY header has no 'format ascii 1.0' or 'format binary_…'; export it again")
-    return _vertices(path, form, tuple(comments), elements, end.end())
+    return _header(path, encoding, tuple(comments), elements, end.end())
 
 
 def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
@@ -169,7 +169,7 @@ def format_ply_header(comments: Iterable[str], **elements: tuple[int, Iterable[s
     return "\n".join([*lines, "end_header", ""]).encode()
 
 
-def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_Element], start: int) -> PlyHeader:
+def _header(path: Path, encoding: str, comments: tuple[str, ...], elements: list[_Element], start: int) -> PlyHeader:
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise DataError(
@@ -184,15 +184,15 @@ def _vertices(path: Path, form: str, comments: tuple[str, ...], elements: list[_
     if not properties or len(set(properties)) < len(properties):
         fault = "a property of the vertices is declared twice" if properties else "its vertices have no properties"
         raise DataError(f"{path}: {fault}; export it again")
-    dtype = np.dtype([(name, ORDERS[form] + kind) for name, kind in vertex.properties])
-    if form == "ascii":
+    dtype = np.dtype([(name, ORDERS[encoding] + type_) for name, type_ in vertex.properties])
+    if encoding == "ascii":
         lines_before = sum(element.count for element in preceding_elements)
-        return PlyHeader(form, comments, vertex.count, dtype, start, lines_before)
-    sections = _sections(elements, ORDERS[form], start)
-    return PlyHeader(form, comments, vertex.count, dtype, sections["vertex"].start, 0, sections)
+        return PlyHeader(encoding, comments, vertex.count, dtype, start, lines_before)
+    sections = _list_sections(elements, ORDERS[encoding], start)
+    return PlyHeader(encoding, comments, vertex.count, dtype, sections["vertex"].start, 0, sections)
 
 
-def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
+def _list_sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
     """Return the sections of a binary file by name, up to an element with a list.  The first of equal names counts."""
     sections: dict[str, Section] = {}
     for element in elements:
@@ -201,8 +201,8 @@ def _sections(elements: list[_Element], order: str, start: int) -> dict[str, Sec
         names = [f"{i} {name}" for i, (name, _) in enumerate(element.properties)]
         if len({name for name, _ in element.properties}) == len(element.properties):
             names = [name for name, _ in element.properties]
-        kinds = [order + kind for _, kind in element.properties]
-        dtype = np.dtype(list(zip(names, kinds, strict=True)))
+        types = [order + type_ for _, type_ in element.properties]
+        dtype = np.dtype(list(zip(names, types, strict=True)))
         sections.setdefault(element.name, Section(element.count, dtype, start))
         start += element.count * dtype.itemsize
     return sections
@@ -212,7 +212,7 @@ RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
 # a mip model, as several programs spell it
 MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)
 FILTER = "filter_3D"
-NUMBERS = ("near", "screen_variance", "compensate", "pixel_box")  # rendering settings with values from 0
+NUMERIC_SETTINGS = ("near", "screen_variance", "compensate", "pixel_box")  # rendering settings with values from 0
 ROWS = 65_536  # rows in memory at once while reading and writing
 MAX_NUMBER = 1e15  # same limit as for numbers in a dataset
 _COLUMNS = {
@@ -231,17 +231,17 @@ def read_ply(path: Path) -> SplatFile:
     """
     with open_file(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))
-        degree = _degree(path, header.dtype.names or ())
+        degree = _find_degree(path, header.dtype.names or ())
         warn_dropped(path, degree)
         rendering, size = read_rendering_comment(path, header), header.count * header.dtype.itemsize
         if header.format == "ascii":
             file.seek(0)
-            parameters = _parameters(path, read_ascii(path, file.read(), header))
+            parameters = _to_parameters(path, read_ascii(path, file.read(), header))
         else:
             require_size(path, file.seek(0, os.SEEK_END), header.start + size, f"{header.count} splats")
             require_memory(path, header.count, degree)
             file.seek(header.start)
-            parameters = _read(path, file, header)
+            parameters = _read_binary(path, file, header)
     return SplatFile(parameters, rendering, "mip" if "filter_variance" in parameters else render_mode(header))
 
 
@@ -267,13 +267,13 @@ def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> 
 
 def _encode_rows(parameters: Parameters) -> bytes:
     """Encode parameters as the rows of a file."""
-    count, rest = parameters["sh_rest"].shape
+    count, rest_columns = parameters["sh_rest"].shape
     means = parameters["means"]
     blocks = [
         means.astype("<f8").view("<f4") if means.dtype == np.float64 else means,  # a double in two columns
         np.zeros((count, 3), np.float32),
         parameters["sh_base"],
-        reorder_columns(parameters["sh_rest"], rest // 3, 3),
+        reorder_columns(parameters["sh_rest"], rest_columns // 3, 3),
         parameters["logit_opacity"],
         parameters["log_scales"],
         parameters["quats"],
@@ -313,7 +313,7 @@ def read_extras(path: Path, table: dict[str, Any]) -> dict[str, Any]:
 
 def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
     """Validate the rendering settings of a file and return them.  Raises DataError for an invalid value."""
-    for name in NUMBERS:
+    for name in NUMERIC_SETTINGS:
         value = values.get(name)
         if value is not None and (not isinstance(value, int | float) or not 0 <= value < MAX_NUMBER):
             raise DataError(
@@ -333,12 +333,12 @@ def check_rendering(path: Path, values: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _read(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
+def _read_binary(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
     """Read the parameters from a file that is positioned at its first row, in blocks of rows."""
     tables: Parameters = {}
     for first in range(0, max(header.count, 1), ROWS):
         rows = min(ROWS, header.count - first)
-        block = _parameters(path, np.frombuffer(file.read(rows * header.dtype.itemsize), header.dtype))
+        block = _to_parameters(path, np.frombuffer(file.read(rows * header.dtype.itemsize), header.dtype))
         if not tables:
             tables = {name: np.empty((header.count, table.shape[1]), table.dtype) for name, table in block.items()}
         for name, table in block.items():
@@ -346,55 +346,55 @@ def _read(path: Path, file: BinaryIO, header: PlyHeader) -> Parameters:
     return tables
 
 
-def _degree(path: Path, names: Sequence[str]) -> int:
+def _find_degree(path: Path, names: Sequence[str]) -> int:
     """Return the SH degree from the property names.  Raises DataError."""
-    rest = sum(name.startswith("f_rest_") for name in names)
-    degree = next((d for d in range(STORED_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == rest), None)
-    if degree is None or not {f"f_rest_{i}" for i in range(rest)} <= set(names):
+    count = sum(name.startswith("f_rest_") for name in names)
+    degree = next((d for d in range(MAX_STORED_DEGREE + 1) if 3 * (sh_coefficients(d) - 1) == count), None)
+    if degree is None or not {f"f_rest_{i}" for i in range(count)} <= set(names):
         raise DataError(
-            f"{path}: has {rest} f_rest properties; expected 0, 9, 24, 45, or 72, numbered from 0; export it again"
+            f"{path}: has {count} f_rest properties; expected 0, 9, 24, 45, or 72, numbered from 0; export it again"
         )
     return degree
 
 
-def _parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
+def _to_parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
     names = vertices.dtype.names or ()
     columns_by_name = dict(_COLUMNS)
     if is_flat := "scale_1" in names and "scale_2" not in names:  # 2DGS
         columns_by_name["log_scales"] = ("scale_0", "scale_1")
-    missing = [column for columns in columns_by_name.values() for column in columns if column not in names]
-    if missing:
+    missing_columns = [column for columns in columns_by_name.values() for column in columns if column not in names]
+    if missing_columns:
         raise DataError(
-            f"{path}: not a splat file: it has no {', '.join(missing[:4])}{' …' if len(missing) > 4 else ''}; "
-            "to train from a point cloud, use `clsplat run`"
+            f"{path}: not a splat file: it has no {', '.join(missing_columns[:4])}"
+            f"{' …' if len(missing_columns) > 4 else ''}; to train from a point cloud, use `clsplat run`"
         )
-    columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_degree(path, names)) - 1)))
-    parameters = {name: _columns(vertices, columns) for name, columns in columns_by_name.items()}
+    columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_find_degree(path, names)) - 1)))
+    parameters = {name: _stack_columns(vertices, columns) for name, columns in columns_by_name.items()}
     if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, which a float cannot hold
         exact_means = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
         parameters["means"] = np.where(np.isfinite(parameters["means"]), exact_means, parameters["means"])
-    rest = reorder_columns(_columns(vertices, columns), 3, len(columns) // 3)
+    rest = reorder_columns(_stack_columns(vertices, columns), 3, len(columns) // 3)
     parameters["sh_rest"] = np.ascontiguousarray(rest[:, : 3 * (sh_coefficients(MAX_DEGREE) - 1)])
     if is_flat:
-        smallest = np.minimum(parameters["log_scales"].min(axis=1, keepdims=True) + FLATNESS, FLAT_LOG_SCALE)
-        parameters["log_scales"] = np.hstack([parameters["log_scales"], smallest]).astype(np.float32)
+        flat_scale = np.minimum(parameters["log_scales"].min(axis=1, keepdims=True) + FLATNESS, FLAT_LOG_SCALE)
+        parameters["log_scales"] = np.hstack([parameters["log_scales"], flat_scale]).astype(np.float32)
     parameters = {name: parameters[name] for name in PARAMETERS}
     if FILTER in names:
-        with np.errstate(over="ignore"):  # infinity is refused later
-            parameters["filter_variance"] = np.square(_columns(vertices, (FILTER,)))
+        with np.errstate(over="ignore"):  # infinity is rejected later
+            parameters["filter_variance"] = np.square(_stack_columns(vertices, (FILTER,)))
     motion = find_motion_columns(names)
     if motion is None:
         raise DataError(
             f"{path}: has only some of the motion properties; expected velocity_0..2, time_center, and log_duration, "
             "and none or all of acceleration_0..2, jerk_0..2, and turn_0..3; export it again"
         )
-    return {**parameters, MOTION: _columns(vertices, motion)} if motion else parameters
+    return {**parameters, MOTION: _stack_columns(vertices, motion)} if motion else parameters
 
 
-def _columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:
+def _stack_columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:
     if not columns:
         return np.zeros((len(vertices), 0), np.float32)
-    with np.errstate(over="ignore"):  # from doubles; infinity is refused later
+    with np.errstate(over="ignore"):  # from doubles; infinity is rejected later
         return np.stack([vertices[c].astype(np.float32) for c in columns], axis=1)
 
 
@@ -409,7 +409,7 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
     check: called with the index of a part and the means of some of its rows, [n, 3]; it may raise an error.
     Raises DataError if a part is damaged or its properties or comments differ from the first, and OutputError.
     """
-    headers = [_header(part) for part in parts]
+    headers = [_read_header(part) for part in parts]
     first, count = headers[0], sum(header.count for header in headers)
     for part, header in zip(parts, headers, strict=True):
         if (header.dtype, header.comments) != (first.dtype, first.comments):
@@ -419,7 +419,7 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
     properties = [f"float {name}" for name in first.dtype.names or ()]
     with open_hashed(path) as output:
         output.write(format_ply_header(first.comments, vertex=(count, properties)))
-        for number, (part, header) in enumerate(zip(parts, headers, strict=True)):
+        for index, (part, header) in enumerate(zip(parts, headers, strict=True)):
             with open_file(part, "a PLY file") as file:
                 file.seek(header.start)
                 for start in range(0, header.count, ROWS):
@@ -428,15 +428,15 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
                     if len(block) < size:
                         raise DataError(f"{part}: is truncated; train that block again")
                     rows = np.frombuffer(block, header.dtype)
-                    check(number, np.stack([rows[axis].astype(np.float32) for axis in "xyz"], axis=1))
+                    check(index, np.stack([rows[axis].astype(np.float32) for axis in "xyz"], axis=1))
                     output.write(block)
     return count
 
 
-def _header(part: Path) -> PlyHeader:
+def _read_header(part: Path) -> PlyHeader:
     with open_file(part, "a PLY file") as file:
         header = parse_ply_header(part, file.read(MAX_HEADER))
-    kinds = {header.dtype[name] for name in header.dtype.names or ()}
-    if header.format != "binary_little_endian" or list(header.sections) != ["vertex"] or kinds != {np.dtype("<f4")}:
+    dtypes = {header.dtype[name] for name in header.dtype.names or ()}
+    if header.format != "binary_little_endian" or list(header.sections) != ["vertex"] or dtypes != {np.dtype("<f4")}:
         raise DataError(f"{part}: expected a PLY written by `export`; export it again")
     return header

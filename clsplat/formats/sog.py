@@ -31,7 +31,7 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_file, read_json
 from clsplat.formats import packing
 from clsplat.formats.packing import from_smallest_three, morton_order, smallest_three, write_bytes
-from clsplat.formats.palette import codebook, nearest_entries, palette, unique_points
+from clsplat.formats.palette import fit_codebook, fit_palette, nearest_entries, unique_points
 from clsplat.formats.ply import read_extras
 from clsplat.formats.sog_quantize import (
     compensate_base,
@@ -64,8 +64,8 @@ META = "meta.json"
 PARTS = ("means", "scales", "quats", "sh0")  # required keys of meta.json; shN is optional
 MAX_META = 1 << 24  # bytes
 MAX_IMAGE = 1 << 30
-KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-RATIO = 2  # largest accepted compression ratio of images in a ZIP; they are already compressed
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+MAX_RATIO = 2  # largest accepted compression ratio of images in a ZIP; they are already compressed
 SLACK = 1 << 16  # bytes or px allowed in addition to the required ones
 
 
@@ -87,7 +87,7 @@ def is_sibling(name: str) -> bool:
     return name == Path(name).name and "\\" not in name and bool(name.strip("."))
 
 
-class Files:
+class SogFiles:
     """The files of a SOG, each of which is read only once.
 
     They are members of a ZIP, in any folder, or files next to a meta.json.
@@ -98,29 +98,29 @@ class Files:
         self.contents: dict[str, bytes] = {}
 
     @property
-    def size(self) -> int:
+    def bytes_read(self) -> int:
         """The number of bytes read so far, at most the size on disk."""
         return min(self.max_size, sum(map(len, self.contents.values())))
 
     def read(self, name: str) -> bytes:
         """Return the content of a file.  Raises DataError if it is missing, too large, or damaged."""
         if name not in self.contents:
-            self.contents[name] = self._member(self.archive, name) if self.archive else self._sibling(name)
+            self.contents[name] = self._unzip(self.archive, name) if self.archive else self._read_sibling(name)
         return self.contents[name]
 
-    def _sibling(self, name: str) -> bytes:
+    def _read_sibling(self, name: str) -> bytes:
         path = self.path if name == META else self.path.with_name(name)
         return read_file(path, "a file of a SOG", limit=MAX_META if name == META else MAX_IMAGE)
 
-    def _member(self, archive: zipfile.ZipFile, name: str) -> bytes:
+    def _unzip(self, archive: zipfile.ZipFile, name: str) -> bytes:
         info = next((info for info in archive.infolist() if info.filename.rpartition("/")[2] == name), None)
-        if info is None or info.compress_type not in KINDS:
+        if info is None or info.compress_type not in COMPRESSIONS:
             fault = f"has no {quote(name)}" if info is None else f"{quote(name)} uses an unsupported compression"
             raise DataError(
                 f"{self.path}: {fault}; expected the files that {META} names, stored or deflated; export it again"
             )
-        images = sum(len(data) for key, data in self.contents.items() if key != META)
-        limit = MAX_META if name == META else min(MAX_IMAGE, SLACK + RATIO * self.max_size - images)
+        image_bytes = sum(len(data) for key, data in self.contents.items() if key != META)
+        limit = MAX_META if name == META else min(MAX_IMAGE, SLACK + MAX_RATIO * self.max_size - image_bytes)
         with archive.open(info) as member:
             data = member.read(limit + 1)
         if len(data) > limit:
@@ -129,15 +129,15 @@ class Files:
 
 
 @contextmanager
-def sog_files(path: Path) -> Iterator[Files]:
+def sog_files(path: Path) -> Iterator[SogFiles]:
     """Open the files of a SOG folder or ZIP.  Raises DataError if the ZIP is missing or damaged."""
     if path.suffix.lower() == ".json":
-        yield Files(path)
+        yield SogFiles(path)
         return
     data = read_file(path, "a .sog file", limit=MAX_FILE)
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            yield Files(path, archive, len(data))
+            yield SogFiles(path, archive, len(data))
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError, KeyError) as error:
         raise DataError(f"{path}: a damaged ZIP file ({quote(error)}); copy or export the file again") from error
 
@@ -147,7 +147,7 @@ MIN_LIMIT = 1 << 19  # splats that a file of any size may have: 0.1 GB in memory
 PER_ROW = 64  # centroids
 MAX_PALETTE = 1 << 16  # centroids, as labels have 16 bits
 WIDTHS = {3: 1, 8: 2, 15: 3}  # SH degree by number of coefficients of a centroid
-LIMIT = 1e30  # of the absolute values in meta.json
+MAX_NUMBER = 1e30  # of the absolute values in meta.json
 LARGEST_W = 252  # alpha of a quaternion whose largest component is w; 253 to 255 for x, y, z
 
 
@@ -163,7 +163,7 @@ def read_sog(path: Path) -> SplatFile:
             meta = json.loads(files.read(META))
         except (ValueError, RecursionError) as error:
             raise DataError(f"{path}: {META} is not valid JSON; copy or export the file again") from error
-        return _Sog(path, meta, files).splats()
+        return _Sog(path, meta, files).decode()
 
 
 def require_plausible(path: Path, count: int, size: int, degree: int = 0) -> None:
@@ -176,7 +176,7 @@ def require_plausible(path: Path, count: int, size: int, degree: int = 0) -> Non
 class _Sog:
     """The meta.json of a SOG, and the files that it lists."""
 
-    def __init__(self, path: Path, meta: Any, files: Files) -> None:
+    def __init__(self, path: Path, meta: Any, files: SogFiles) -> None:
         self.path, self.meta, self.files = path, meta, files
         shape = self._part("means").get("shape")
         self.is_version_1 = "version" not in meta and isinstance(shape, list)
@@ -184,51 +184,51 @@ class _Sog:
         if version not in (1, 2):
             raise DataError(f"{path}: SOG version {quote(version)}; expected 1 or 2; export it again")
         self.count = self._require_count("count", shape[0] if self.is_version_1 and shape else meta.get("count"))
-        self.images = {name: self._data(name) for name in PARTS}
-        require_plausible(path, self.count, files.size, MAX_DEGREE if "shN" in meta else 0)
+        self.images = {name: self._read_files(name) for name in PARTS}
+        require_plausible(path, self.count, files.bytes_read, MAX_DEGREE if "shN" in meta else 0)
 
-    def splats(self) -> SplatFile:
+    def decode(self) -> SplatFile:
         """Decode all splats."""
-        base = self._pixels("sh0", 0)
-        scales, opacity = self._decode("scales", self._pixels("scales", 0)[:, :3]), base[:, 3]
+        base = self._read_pixels("sh0", 0)
+        scales, opacity = self._decode("scales", self._read_pixels("scales", 0)[:, :3]), base[:, 3]
         logit = logits(opacity[:, None] / 255.0)
         if self.is_version_1:
-            minimum, maximum = self._ranges("sh0", 4)
+            minimum, maximum = self._read_ranges("sh0", 4)
             logit = (minimum[3] + (maximum[3] - minimum[3]) * (opacity[:, None] / 255.0)).astype(np.float32)
         parameters = {
-            "means": self._means(),
-            "quats": self._quats(),
+            "means": self._decode_means(),
+            "quats": self._decode_quats(),
             "log_scales": scales,
             "logit_opacity": logit,
             "sh_base": self._decode("sh0", base[:, :3]),
-            "sh_rest": self._sh_rest(),
+            "sh_rest": self._decode_sh_rest(),
         }
-        mip = self.meta.get("model") == "antialiased" or self.meta.get("antialias") is True
-        return SplatFile(parameters, read_extras(self.path, self.meta), "mip" if mip else "default")
+        is_mip = self.meta.get("model") == "antialiased" or self.meta.get("antialias") is True
+        return SplatFile(parameters, read_extras(self.path, self.meta), "mip" if is_mip else "default")
 
-    def _means(self) -> NDArray[np.float32]:
-        low, high = (self._pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
-        minimum, maximum = self._ranges("means", 3)
+    def _decode_means(self) -> NDArray[np.float32]:
+        low, high = (self._read_pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
+        minimum, maximum = self._read_ranges("means", 3)
         span = np.where(maximum > minimum, maximum - minimum, 1)
         t = minimum + (low | high << np.uint16(8)) / 65535.0 * span
-        with np.errstate(over="ignore"):  # infinite positions raise DataError later
+        with np.errstate(over="ignore"):  # infinite positions are rejected later
             return (np.sign(t) * np.expm1(np.abs(t))).astype(np.float32)
 
-    def _quats(self) -> NDArray[np.float32]:
-        pixels = self._pixels("quats", 0)
+    def _decode_quats(self) -> NDArray[np.float32]:
+        pixels = self._read_pixels("quats", 0)
         is_valid = pixels[:, 3] >= LARGEST_W
-        largest = np.where(is_valid, pixels[:, 3], LARGEST_W).astype(np.intp) - LARGEST_W
-        quats = from_smallest_three(largest, (pixels[:, :3] / 255.0 - 0.5) * 2**0.5)
+        largest_index = np.where(is_valid, pixels[:, 3], LARGEST_W).astype(np.intp) - LARGEST_W
+        quats = from_smallest_three(largest_index, (pixels[:, :3] / 255.0 - 0.5) * 2**0.5)
         quats[~is_valid] = [1, 0, 0, 0]
         return quats
 
-    def _sh_rest(self) -> NDArray[np.float32]:
+    def _decode_sh_rest(self) -> NDArray[np.float32]:
         if "shN" not in self.meta:
             return np.zeros((self.count, 0), np.float32)
-        files = self._data("shN")
+        files = self._read_files("shN")
         if len(files) != 2:
             raise DataError(f"{self.path}: shN has {len(files)} files; expected centroids and labels; export it again")
-        labels = packing.decode(self.path, "labels of shN", files[1], self.count, SLACK + 4 * self.count)
+        labels = packing.decode_webp(self.path, "labels of shN", files[1], self.count, SLACK + 4 * self.count)
         splat_labels = labels[: self.count, 0].astype(np.intp) | labels[: self.count, 1].astype(np.intp) << 8
         used_entries = entries = 1 + int(splat_labels.max(initial=0))
         if self.is_version_1:
@@ -236,19 +236,19 @@ class _Sog:
         else:
             entries = self._require_count("shN.count", self._part("shN").get("count", used_entries), MAX_PALETTE)
             degree = self._require_count("shN.bands", self._part("shN").get("bands"), MAX_DEGREE)
-        size = sh_coefficients(degree) - 1
+        coefficients = sh_coefficients(degree) - 1
         if used_entries > entries:
             raise DataError(
                 f"{self.path}: labels of shN use {used_entries} centroids, but shN.count is {entries}; export it again"
             )
-        limit = SLACK + 4 * size * MAX_PALETTE
-        centroids = packing.decode(self.path, "centroids of shN", files[0], entries * size, limit)
-        table = centroids[: entries * size, :3].reshape(entries, 3 * size)
+        limit = SLACK + 4 * coefficients * MAX_PALETTE
+        centroids = packing.decode_webp(self.path, "centroids of shN", files[0], entries * coefficients, limit)
+        table = centroids[: entries * coefficients, :3].reshape(entries, 3 * coefficients)
         return np.asarray(self._decode("shN", table)[splat_labels])
 
     def _degree_of_width(self, data: bytes) -> int:
         """Return the SH degree of a version 1 file, from the width of its image of centroids, 64 per row."""
-        width, _ = packing.size(self.path, "centroids of shN", data)
+        width, _ = packing.webp_size(self.path, "centroids of shN", data)
         if width // PER_ROW not in WIDTHS:
             raise DataError(
                 f"{self.path}: centroids of shN are {width} px wide; expected 192, 512, or 960; export it again"
@@ -264,10 +264,10 @@ class _Sog:
         if name == "shN":
             minimum, maximum = (self._read_numbers(f"shN.{key}", [part.get(key)], 1) for key in ("mins", "maxs"))
         else:
-            minimum, maximum = (values[: levels.shape[1]] for values in self._ranges(name, 3))
+            minimum, maximum = (values[: levels.shape[1]] for values in self._read_ranges(name, 3))
         return (minimum + levels / 255.0 * (maximum - minimum)).astype(np.float32)
 
-    def _pixels(self, name: str, index: int) -> NDArray[np.uint8]:
+    def _read_pixels(self, name: str, index: int) -> NDArray[np.uint8]:
         """Return the pixels of an image of a part, one pixel per splat, [count, 4]."""
         images = self.images[name]
         if index >= len(images):
@@ -275,7 +275,7 @@ class _Sog:
                 f"{self.path}: {name} names {len(images)} files; expected at least {index + 1}; export it again"
             )
         label, limit = f"image {index} of {name}", SLACK + 4 * self.count
-        return packing.decode(self.path, label, images[index], self.count, limit)[: self.count]
+        return packing.decode_webp(self.path, label, images[index], self.count, limit)[: self.count]
 
     def _part(self, name: str) -> dict[str, Any]:
         part = self.meta.get(name) if isinstance(self.meta, dict) else None
@@ -285,7 +285,7 @@ class _Sog:
             )
         return part
 
-    def _data(self, name: str) -> list[bytes]:
+    def _read_files(self, name: str) -> list[bytes]:
         """Return the contents of the files of a part.  Raises DataError for names outside the folder."""
         names = self._part(name).get("files")
         if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(file, str) for file in names):
@@ -299,7 +299,7 @@ class _Sog:
             )
         return [self.files.read(file) for file in names]
 
-    def _ranges(self, name: str, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _read_ranges(self, name: str, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         part = self._part(name)
         minimum, maximum = (self._read_numbers(f"{name}.{key}", part.get(key), count) for key in ("mins", "maxs"))
         return minimum, maximum
@@ -307,9 +307,10 @@ class _Sog:
     def _read_numbers(self, key_path: str, value: Any, count: int) -> NDArray[np.float64]:
         """Return a list of at least `count` numbers as an array.  Raises DataError for another value."""
         is_list = isinstance(value, list) and count <= len(value) <= 256
-        if not is_list or not all(isinstance(number, int | float) and abs(number) < LIMIT for number in value):
+        if not is_list or not all(isinstance(number, int | float) and abs(number) < MAX_NUMBER for number in value):
             raise DataError(
-                f"{self.path}: {key_path} is {quote(value)}; expected {count} numbers below {LIMIT:g}; export it again"
+                f"{self.path}: {key_path} is {quote(value)}; "
+                f"expected {count} numbers below {MAX_NUMBER:g}; export it again"
             )
         return np.array(value, np.float64)
 
@@ -330,7 +331,7 @@ QUAT_STEP = 4  # of quaternions, in levels of 1/255
 SIZE_STEP = 0.25  # step of positions of median weight, relative to the Gaussian's size
 SCALE_STEP = 0.1  # of log scales
 COLOR_STEP = 0.05  # of coefficients of band 0; 1 changes a color by 0.28
-SMALLEST = 1024  # palette entries in training for 1,024 splats; they grow with the number of splats
+BASE_ENTRIES = 1024  # palette entries in training for 1,024 splats; more splats get more entries
 DIGITS = 16  # digits of the SHA-256 in the names of images in a folder
 EPOCH = (1980, 1, 1, 0, 0, 0)  # time of files in the ZIP, fixed so that the same model gives the same bytes
 
@@ -344,10 +345,10 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     require_gaussians(path, splats)
     require_in_range(path, splats, "SOG")
     ordered = splats.rows(morton_order(splats.parameters["means"]))
-    return write_as_ordered(path, ordered, log_weights(ordered.parameters, ordered.has_sky), options)
+    return write_ordered_sog(path, ordered, log_weights(ordered.parameters, ordered.has_sky), options)
 
 
-def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:
+def write_ordered_sog(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:
     """Write a SOG as `write_sog` does, but keep the order of the splats.
 
     weights: base-2 logarithms, [N], from `log_weights` of the entire model, of which the splats may be a subset.
@@ -362,24 +363,24 @@ def write_as_ordered(path: Path, splats: SplatFile, weights: NDArray[np.float64]
     if splats.rendering:
         meta["extras"] = {"clsplat": splats.rendering}
 
-    def image(name: str, *planes: NDArray[Any], columns: int = width) -> str:
+    def write_image(name: str, *planes: NDArray[Any], columns: int = width) -> str:
         pixels = np.full((len(planes[0]), 4), 255, np.uint8)
         pixels[:, : len(planes)] = np.stack(planes, axis=1)
-        data = packing.encode(path, pixels, columns)
+        data = packing.encode_webp(path, pixels, columns)
         name += f"_{sha256(data).hexdigest()[:DIGITS]}" * in_folder + ".webp"
         images[name] = data
         return name
 
-    meta["means"] = _means(p, image)
-    largest, components = smallest_three(unit(p["quats"]))
+    meta["means"] = _write_means(p, write_image)
+    largest_index, components = smallest_three(unit(p["quats"]))
     levels = np.clip(np.rint(255 * (components * 0.5**0.5 + 0.5)), 0, 255)
-    meta["quats"] = {"files": [image("quats", *levels.T, LARGEST_W + largest)]}
+    meta["quats"] = {"files": [write_image("quats", *levels.T, LARGEST_W + largest_index)]}
     for name, table, alpha in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
-        entries = codebook(p[table])
+        entries = fit_codebook(p[table])
         planes = nearest_entries(p[table], entries).T
-        meta[name] = {"codebook": [_round(number) for number in entries], "files": [image(name, *planes, *alpha)]}
+        meta[name] = {"codebook": [_round(number) for number in entries], "files": [write_image(name, *planes, *alpha)]}
     if harmonics is not None:
-        meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, image)
+        meta["shN"] = _write_harmonics(harmonics, splats.sh_degree, write_image)
     images[META] = json.dumps(meta, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
     return _write_folder(path, images) if in_folder else write_bytes(path, _zip(images))
 
@@ -389,24 +390,24 @@ def _write_folder(path: Path, images: dict[str, bytes]) -> str:
     old_files, new_files = set(sog_folder_files(path)), {path.with_name(name) for name in images}
     obsolete_files = new_files - old_files
     try:
-        sums = [write_bytes(path.with_name(name), data) for name, data in images.items()]
+        hashes = [write_bytes(path.with_name(name), data) for name, data in images.items()]
         obsolete_files = old_files - new_files
     finally:
         for file in obsolete_files - set(sog_folder_files(path)):
             if file.suffix == ".webp":
                 with suppress(OSError):
                     file.unlink()
-    return sums[-1]
+    return hashes[-1]
 
 
-def _means(p: Parameters, image: Any) -> dict[str, Any]:
+def _write_means(p: Parameters, write_image: Any) -> dict[str, Any]:
     means = p["means"].astype(np.float64)
     t = np.sign(means) * np.log1p(np.abs(means))
     extrema = zip((t.min(axis=0), t.max(axis=0)), (ROUND_FLOOR, ROUND_CEILING), strict=True)
     minimum, maximum = (np.array([_round(value, rounding) for value in values]) for values, rounding in extrema)
     span = np.where(maximum > minimum, maximum - minimum, 1)
     levels = np.rint(65535 * (t - minimum) / span).astype(np.uint16)
-    files = [image("means_l", *(levels & 255).T), image("means_u", *(levels >> 8).T)]
+    files = [write_image("means_l", *(levels & 255).T), write_image("means_u", *(levels >> 8).T)]
     return {"mins": minimum.tolist(), "maxs": maximum.tolist(), "files": files}
 
 
@@ -437,7 +438,7 @@ class Harmonics:
         weights: of the squared errors, [N].  refine: returns a better palette, [E, c], and the label of each splat.
         step: multiple to which codebook values are rounded if at most 256 of them remain.
         """
-        vectors, labels = palette(rest, _training_entries(len(rest), quality), weights)
+        vectors, labels = fit_palette(rest, _training_entries(len(rest), quality), weights)
         if weights.any() and not np.array_equal(vectors[labels].astype(np.float32), rest):
             vectors, labels = refine(vectors)
         return cls.from_vectors(vectors, labels, step)
@@ -447,7 +448,7 @@ class Harmonics:
         cls, vectors: NDArray[np.float64], labels: NDArray[np.int64], step: float | None = None
     ) -> "Harmonics":
         """Quantize palette vectors, [E, c], with a codebook.  labels: [N] rows of `vectors`, one per splat."""
-        entries = np.array([_round(entry) for entry in codebook(vectors, step)])
+        entries = np.array([_round(entry) for entry in fit_codebook(vectors, step)])
         return cls(entries, nearest_entries(vectors, entries), labels)
 
     @property
@@ -458,7 +459,7 @@ class Harmonics:
 
 def _training_entries(count: int, quality: Quality) -> int:
     """Return the number of palette entries that training uses for `count` splats."""
-    return min(PALETTES[quality], max(1, int(SMALLEST * 2.0 ** np.floor(np.log2(count / SMALLEST)))))
+    return min(PALETTES[quality], max(1, int(BASE_ENTRIES * 2.0 ** np.floor(np.log2(count / BASE_ENTRIES)))))
 
 
 def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
@@ -489,10 +490,10 @@ def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> 
     return {**p, **rounded_tables}, harmonics
 
 
-def _write_harmonics(sh: Harmonics, bands: int, image: Any) -> dict[str, Any]:
+def _write_harmonics(sh: Harmonics, bands: int, write_image: Any) -> dict[str, Any]:
     size = sh.palette.shape[1] // 3
-    files = [image("shN_centroids", *sh.palette.reshape(-1, 3).T, columns=PER_ROW * size)]
-    files.append(image("shN_labels", sh.labels & 255, sh.labels >> 8, np.zeros_like(sh.labels)))
+    files = [write_image("shN_centroids", *sh.palette.reshape(-1, 3).T, columns=PER_ROW * size)]
+    files.append(write_image("shN_labels", sh.labels & 255, sh.labels >> 8, np.zeros_like(sh.labels)))
     return {"count": len(sh.palette), "bands": bands, "codebook": sh.codebook.tolist(), "files": files}
 
 

@@ -37,14 +37,14 @@ def round_means(
 
     The step is proportional to 1 / sqrt(weight), rounded to a power-of-two number of SOG levels.
     """
-    levels, low, level = _levels(means)
+    levels, low, level = _to_levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
     bits = np.log2(fraction * sizes) - log_weights[:, None] / 2
     step = np.exp2(np.clip(np.floor(bits), 0, MAX_ZERO_BITS))
-    return _positions(low + np.clip(np.rint(levels / step) * step, 0, LEVELS) * level)
+    return _to_positions(low + np.clip(np.rint(levels / step) * step, 0, LEVELS) * level)
 
 
-def _levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _to_levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Quantize positions: return levels, [N, 3], and for each axis the smallest logarithm and the level's size, [3]."""
     positions = means.astype(np.float64)
     logarithms = np.sign(positions) * np.log1p(np.abs(positions))
@@ -59,7 +59,7 @@ def _sizes(means: Floats, log_scales: Floats) -> NDArray[np.float64]:
     return np.asarray(size / (1 + np.abs(means.astype(np.float64))))
 
 
-def _positions(logarithms: NDArray[np.float64]) -> NDArray[np.float32]:
+def _to_positions(logarithms: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.asarray(np.sign(logarithms) * np.expm1(np.abs(logarithms)), np.float32)
 
 
@@ -74,9 +74,9 @@ def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[n
     for index, (w, x, y, z) in enumerate(_ROTATIONS):
         abs_w = np.abs(q[:, 0] * w - q[:, 1] * x - q[:, 2] * y - q[:, 3] * z)
         rotations, max_abs_w = np.where(abs_w > max_abs_w, index, rotations), np.maximum(abs_w, max_abs_w)
-    largest, components = smallest_three(multiply(q, _ROTATIONS[rotations]))
+    largest_index, components = smallest_three(multiply(q, _ROTATIONS[rotations]))
     levels = np.clip(np.rint(255 * (components * 0.5**0.5 + 0.5) / step) * step, 0, 255)
-    rounded_quats = from_smallest_three(largest, (levels / 255 - 0.5) * 2**0.5)
+    rounded_quats = from_smallest_three(largest_index, (levels / 255 - 0.5) * 2**0.5)
     return rounded_quats, log_scales[rows[:, None], _axes(_ROTATIONS)[rotations]].astype(np.float32)
 
 
@@ -111,11 +111,11 @@ def visible_form(rest: Floats) -> NDArray[np.float64]:
 
     The result is bit-identical for any number of threads.
     """
-    largest = robust_max(rest)
+    max_value = robust_max(rest)
     count = rest.shape[1] // 3
     form = np.zeros((count, count))
-    for start in range(0, len(rest) if largest else 0, ROWS):
-        block = rest[start : start + ROWS].astype(np.float64) / largest
+    for start in range(0, len(rest) if max_value else 0, ROWS):
+        block = rest[start : start + ROWS].astype(np.float64) / max_value
         levels = np.rint(PALETTE_LEVELS * np.clip(block, -1, 1)).reshape(-1, count, 3)
         for channel in range(3):
             form += levels[:, :, channel].T @ levels[:, :, channel]
@@ -166,28 +166,28 @@ LLOYD_STEPS = 3  # per split
 SPLIT_FRACTION = 0.5  # largest fraction of clusters split before errors are recomputed
 TINY_WEIGHT = 1e-300  # replaces the weight of an empty cluster
 SH_LEVELS = 128  # in a coefficient of 1
-LARGEST_STEP = 64.0  # levels
+MAX_STEP = 64.0  # levels
 Labels = NDArray[np.int64]
 
 
 def tree_palette(
-    rest: NDArray[np.float32], log_weights: NDArray[np.float64], entries: int, median_step: float
+    rest: NDArray[np.float32], log_weights: NDArray[np.float64], max_entries: int, median_step: float
 ) -> tuple[NDArray[np.float64], Labels]:
-    """Return a palette of at most `entries` vectors, [E, 3 K], for SH [N, 3 K], and the label of each Gaussian, [N].
+    """Return at most `max_entries` palette vectors, [E, 3 K], for SH [N, 3 K], and the label of each Gaussian, [N].
 
     log_weights: [N], from `log_weights`.  median_step: median rounding step of the vectors, in levels of
     1 / SH_LEVELS, for coefficients of typical size.
     """
     form, weights = visible_form(rest), np.exp2(log_weights)
-    labels = _split_clusters(_to_euclidean(rest, form), weights, entries)
+    labels = _split_clusters(_to_euclidean(rest, form), weights, max_entries)
     totals = np.bincount(labels, weights)
-    vectors = _sums(labels, weights, rest, len(totals)) / totals[:, None]
+    vectors = _label_sums(labels, weights, rest, len(totals)) / totals[:, None]
     log_totals = np.log2(totals)
     log_totals -= np.median(log_totals)
-    step = quantization_steps(log_totals, scaled_step(rest, median_step, median_step), LARGEST_STEP)
-    first = np.zeros(len(totals), np.int64)
-    first[labels[::-1]] = np.arange(len(labels))[::-1]
-    order = np.lexsort((first, step))
+    step = quantization_steps(log_totals, scaled_step(rest, median_step, median_step), MAX_STEP)
+    first_rows = np.zeros(len(totals), np.int64)
+    first_rows[labels[::-1]] = np.arange(len(labels))[::-1]
+    order = np.lexsort((first_rows, step))
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     rounded_vectors = round_sh(SH_LEVELS * vectors, step, form).astype(np.float64) / SH_LEVELS
@@ -205,16 +205,16 @@ def _to_euclidean(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArr
     return transformed.reshape(rest.shape)
 
 
-def _split_clusters(points: NDArray[np.float32], weights: NDArray[np.float64], entries: int) -> Labels:
-    """Split points, [N, c], into at most `entries` clusters, and return the label of each point, [N]."""
+def _split_clusters(points: NDArray[np.float32], weights: NDArray[np.float64], max_clusters: int) -> Labels:
+    """Split points, [N, c], into at most `max_clusters` clusters, and return the label of each point, [N]."""
     labels, cluster_count = np.zeros(len(points), np.int64), 1
-    while cluster_count < entries:
+    while cluster_count < max_clusters:
         totals = np.maximum(np.bincount(labels, weights, minlength=cluster_count), TINY_WEIGHT)  # a half can be empty
-        mean = _sums(labels, weights, points, cluster_count) / totals[:, None]
+        mean = _label_sums(labels, weights, points, cluster_count) / totals[:, None]
         offsets = (points - mean[labels]).astype(np.float32)
-        spread = _sums(labels, weights, np.square(offsets), cluster_count)
+        spread = _label_sums(labels, weights, np.square(offsets), cluster_count)
         errors = np.where(np.bincount(labels, minlength=cluster_count) > 1, spread.sum(axis=1), 0)
-        max_splits = min(entries - cluster_count, -(-cluster_count // round(1 / SPLIT_FRACTION)))
+        max_splits = min(max_clusters - cluster_count, -(-cluster_count // round(1 / SPLIT_FRACTION)))
         split_clusters = np.argsort(-errors, kind="stable")[:max_splits]
         split_clusters = split_clusters[errors[split_clusters] > 0]
         if not len(split_clusters):
@@ -238,7 +238,7 @@ def _bisect(
     for _ in range(LLOYD_STEPS):
         half = 2 * cluster + is_second
         totals = np.maximum(np.bincount(half, weights, minlength=2 * cluster_count), TINY_WEIGHT)
-        means = (_sums(half, weights, points, 2 * cluster_count) / totals[:, None]).reshape(cluster_count, 2, -1)
+        means = (_label_sums(half, weights, points, 2 * cluster_count) / totals[:, None]).reshape(cluster_count, 2, -1)
         axis = means[:, 1] - means[:, 0]
         threshold = (axis * (means[:, 0] + means[:, 1]) / 2).sum(axis=1)
         projection = np.zeros(len(points))
@@ -248,7 +248,7 @@ def _bisect(
     return is_second
 
 
-def _sums(
+def _label_sums(
     labels: Labels, weights: NDArray[np.float64], points: NDArray[np.floating], cluster_count: int
 ) -> NDArray[np.float64]:
     """Return the weighted sum of the points of each label, [clusters, c], added in the order of the points."""
@@ -258,7 +258,7 @@ def _sums(
 
 # Estimate how much each Gaussian contributes to renders, from the model alone.
 
-LARGEST = 10.0  # limit of the absolute logarithms
+MAX_LOG_WEIGHT = 10.0  # limit of the absolute logarithms
 # Sky Gaussians are recognized by a gap in distance: clsplat/gaussians/conversion.py places them 10 times as far away as
 # 97 % of the scene.  Their row numbers do not help, because models are cropped, decimated, sorted, and rounded later.
 GAP, INSIDE = 5.0, 0.97
@@ -266,7 +266,7 @@ MIN_INSIDE, MIN_BEHIND = 0.01, 0.05  # fractions of all Gaussians
 
 
 def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
-    """Return the base-2 logarithms of each Gaussian's weight in renders, [N], from -LARGEST to LARGEST.
+    """Return the base-2 logarithms of each Gaussian's weight in renders, [N], from -MAX_LOG_WEIGHT to MAX_LOG_WEIGHT.
 
     Their median is 0, and they do not depend on the scale of the model.  has_sky: whether some Gaussians represent a
     sky; these are excluded from the median.
@@ -275,14 +275,14 @@ def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
         return np.zeros(0)
     means, scales = p["means"].astype(np.float64), np.sort(p["log_scales"].astype(np.float64), axis=1)
     squares = np.square(means - np.median(means, axis=0)).sum(axis=1)
-    is_scene = before_gap(np.sqrt(squares)) if has_sky else np.ones(len(squares), np.bool_)
+    is_scene = is_before_gap(np.sqrt(squares)) if has_sky else np.ones(len(squares), np.bool_)
     squares += np.maximum(np.median(squares[is_scene]), 1e-30)
     opacity = -np.logaddexp(0, -p["logit_opacity"][:, 0].astype(np.float64))
     logs = (opacity + (scales[:, 1] + scales[:, 2] - np.log(squares)) / 2) / np.log(2)
-    return np.asarray(np.clip(logs - np.median(logs[is_scene]), -LARGEST, LARGEST))
+    return np.asarray(np.clip(logs - np.median(logs[is_scene]), -MAX_LOG_WEIGHT, MAX_LOG_WEIGHT))
 
 
-def before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask, [N], of the distances below the gap that separates a sky.  Without a gap, all are below."""
     ordered, count = np.sort(distances), len(distances)
     counts = np.arange(1, count + 1)

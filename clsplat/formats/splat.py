@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.core.reading import read_file
-from clsplat.formats.packing import outside_bytes, warn_clipped, write_bytes
+from clsplat.formats.packing import exceeds_byte, warn_clipped, write_bytes
 from clsplat.formats.splats import (
     MAX_FILE,
     SH_C0,
@@ -39,7 +39,7 @@ from clsplat.formats.splats import (
 
 LOG = logging.getLogger("clsplat")
 ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)])
-LARGEST_SCALE = 1e6  # scene units; text misread as numbers has larger values
+MAX_SCALE = 1e6  # scene units; text misread as numbers has larger values
 EXPECTED = "a .splat file with 32 bytes per splat"
 
 
@@ -52,7 +52,7 @@ def looks_like_splat(data: bytes, size: int) -> bool:
     if not np.isfinite(rows["position"]).all():
         return False
     scale = rows["scale"]
-    return bool((np.isfinite(scale) & (scale >= 0) & (scale < LARGEST_SCALE)).all() and scale.any())
+    return bool((np.isfinite(scale) & (scale >= 0) & (scale < MAX_SCALE)).all() and scale.any())
 
 
 def read_splat(path: Path) -> SplatFile:
@@ -90,9 +90,9 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     rows = np.zeros(len(splats), ROW)
     rows["position"] = p["means"]
     with np.errstate(over="ignore"):
-        rows["scale"] = np.minimum(np.exp(p["log_scales"].astype(np.float64)), LARGEST_SCALE / 2)
+        rows["scale"] = np.minimum(np.exp(p["log_scales"].astype(np.float64)), MAX_SCALE / 2)
     color = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
-    warn_clipped(path, "splat", "colors from 0 to 1", outside_bytes(255 * color))
+    warn_clipped(path, "splat", "colors from 0 to 1", exceeds_byte(255 * color))
     if p["sh_rest"].shape[1]:
         LOG.warning(
             "%s: .splat stores no SH coefficients, so colors do not depend on the view; other formats do",
@@ -110,7 +110,7 @@ MAX_DEGREE = 2
 SH_RANGE = (-1.5, 1.5)
 RANGE = 32767
 # position, scale and rotation, SH by level
-KINDS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
+FIELD_TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,8 @@ class SplatSection:
     block: float  # side of a bucket, scene units
     bucket_bytes: int
     range: int
-    full: int  # number of full buckets
-    partial: int  # number of partial buckets
+    full_buckets: int
+    partial_buckets: int
 
     @classmethod
     def parse(cls, data: bytes, start: int) -> "SplatSection":
@@ -135,16 +135,16 @@ class SplatSection:
         count, rows, size, buckets, block, bucket_bytes, scale, _, full, partial, degree = values
         return cls(count, rows, degree, size, buckets, block, bucket_bytes, scale or RANGE, full, partial)
 
-    def row(self, level: int) -> np.dtype[Any]:
+    def row_dtype(self, level: int) -> np.dtype[Any]:
         """Return the layout of one splat."""
-        position, scale, sh = KINDS[level]
+        position, scale, sh = FIELD_TYPES[level]
         fields: list[Any] = [("position", position, 3), ("scale", scale, 3), ("rotation", scale, 4)]
         fields += [("color", "u1", 4), ("sh", sh, 3 * (sh_coefficients(self.degree) - 1))]
         return np.dtype(fields)
 
     def sizes(self, level: int) -> tuple[int, int, int]:
         """Return the sizes in bytes of the counts of partial buckets, of the buckets, and of the splats."""
-        return 4 * self.partial, self.bucket_bytes * self.buckets, self.row(level).itemsize * self.rows
+        return 4 * self.partial_buckets, self.bucket_bytes * self.buckets, self.row_dtype(level).itemsize * self.rows
 
 
 def looks_like_ksplat(data: bytes, size: int) -> bool:
@@ -152,7 +152,7 @@ def looks_like_ksplat(data: bytes, size: int) -> bool:
     if size < HEADER + SECTION or len(data) < HEADER or data[0] != 0 or not 1 <= data[1] < 32:
         return False
     max_sections, sections, _, splats, level = struct.unpack_from("<4IH", data, 4)
-    return bool(sections <= max_sections <= size // SECTION and level < len(KINDS) and 0 < splats <= size // 24)
+    return bool(sections <= max_sections <= size // SECTION and level < len(FIELD_TYPES) and 0 < splats <= size // 24)
 
 
 def read_ksplat(path: Path) -> SplatFile:
@@ -164,47 +164,48 @@ def read_ksplat(path: Path) -> SplatFile:
     if not looks_like_ksplat(data, len(data)):
         raise DataError(f"{path}: not a .ksplat file of version 0.1 with a header of {HEADER} bytes; copy it again")
     sections = sections or max_sections  # `sections` counts those loaded so far; some writers leave it at 0
-    ends = struct.unpack_from("<2f", data, 36)
+    sh_range = struct.unpack_from("<2f", data, 36)
     start = HEADER + SECTION * max_sections
     require_size(path, len(data), start, f"{max_sections} sections")
     parts = []
-    for number in range(sections):
-        section = SplatSection.parse(data, HEADER + SECTION * number)
-        _check(path, section, number)
+    for index in range(sections):
+        section = SplatSection.parse(data, HEADER + SECTION * index)
+        _check_section(path, section, index)
         sizes = section.sizes(level)
-        require_size(path, len(data), start + sum(sizes), f"{section.rows} splats in section {number}")
+        require_size(path, len(data), start + sum(sizes), f"{section.rows} splats in section {index}")
         require_memory(path, section.count, section.degree)
-        parts.append(_tables(path, data, start, section, level, ends if any(ends) else SH_RANGE))
+        parts.append(_decode_section(path, data, start, section, level, sh_range if any(sh_range) else SH_RANGE))
         start += sum(sizes)
     return SplatFile(concatenate(parts))
 
 
-def _check(path: Path, section: SplatSection, number: int) -> None:
+def _check_section(path: Path, section: SplatSection, index: int) -> None:
     """Raise DataError for an invalid section."""
     if section.degree > MAX_DEGREE or section.count > section.rows:
         raise DataError(
-            f"{path}: section {number} has {section.count} of {section.rows} splats with SH degree {section.degree}; "
+            f"{path}: section {index} has {section.count} splats in {section.rows} rows, SH degree {section.degree}; "
             f"expected no more splats than rows, and degree 0 to {MAX_DEGREE}; the file is damaged, copy it again"
         )
-    if (section.buckets and section.bucket_bytes < 12) or section.full + section.partial > section.buckets:
-        raise DataError(f"{path}: the buckets of section {number} do not match their counts; copy the file again")
+    bucket_count = section.full_buckets + section.partial_buckets
+    if (section.buckets and section.bucket_bytes < 12) or bucket_count > section.buckets:
+        raise DataError(f"{path}: the buckets of section {index} do not match their counts; copy the file again")
 
 
-def _tables(
-    path: Path, data: bytes, start: int, section: SplatSection, level: int, ends: tuple[float, ...]
+def _decode_section(
+    path: Path, data: bytes, start: int, section: SplatSection, level: int, sh_range: tuple[float, ...]
 ) -> dict[str, NDArray[np.float32]]:
     """Return the parameters of one section."""
     partial, buckets, _ = section.sizes(level)
-    rows = np.frombuffer(data, section.row(level), section.count, start + partial + buckets)
+    rows = np.frombuffer(data, section.row_dtype(level), section.count, start + partial + buckets)
     position = rows["position"].astype(np.float64)
     if level and section.count:
         position = (position - section.range) * (section.block / 2 / section.range)
-        position += _centers(path, data, start, section)
+        position += _bucket_centers(path, data, start, section)
     sh = rows["sh"].astype(np.float64)
     if level == 2:
-        sh = ends[0] + sh / 255 * (ends[1] - ends[0])
+        sh = sh_range[0] + sh / 255 * (sh_range[1] - sh_range[0])
     color = rows["color"] / 255.0
-    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are refused later
+    with np.errstate(over="ignore", invalid="ignore"):  # values that are not finite are rejected later
         bands = [band.astype(np.float32) for band in np.split(sh, [9], axis=1)]  # channel-major, for each degree
         return {
             "means": position.astype(np.float32),
@@ -216,15 +217,15 @@ def _tables(
         }
 
 
-def _centers(path: Path, data: bytes, start: int, section: SplatSection) -> NDArray[np.float64]:
+def _bucket_centers(path: Path, data: bytes, start: int, section: SplatSection) -> NDArray[np.float64]:
     """Return the center of each splat's bucket, [count, 3]; full buckets come first, then partial ones."""
-    partial = np.frombuffer(data, "<u4", section.partial, start).astype(np.int64)
-    filled = section.full * section.bucket_size
+    partial = np.frombuffer(data, "<u4", section.partial_buckets, start).astype(np.int64)
+    filled = section.full_buckets * section.bucket_size
     if filled + int(partial.sum()) < section.count or filled > section.rows:
         raise DataError(f"{path}: its buckets have fewer splats than the {section.count} declared; copy the file again")
-    counts = np.concatenate([np.full(section.full, section.bucket_size), np.minimum(partial, section.count)])
+    counts = np.concatenate([np.full(section.full_buckets, section.bucket_size), np.minimum(partial, section.count)])
     ends = np.minimum(np.cumsum(counts), section.count)
     bucket = np.repeat(np.arange(len(counts)), np.diff(ends, prepend=0))
-    table = np.frombuffer(data, "u1", section.bucket_bytes * section.buckets, start + 4 * section.partial)
+    table = np.frombuffer(data, "u1", section.bucket_bytes * section.buckets, start + 4 * section.partial_buckets)
     centers = table.reshape(section.buckets, section.bucket_bytes)[:, :12].copy().view("<f4")
     return centers[bucket].astype(np.float64)

@@ -75,14 +75,14 @@ def find_motion_columns(names: Collection[str]) -> tuple[str, ...] | None:
 
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
-STORED_DEGREE = 4  # largest SH degree in files; bands beyond MAX_DEGREE are dropped
+MAX_STORED_DEGREE = 4  # largest SH degree in files; bands beyond MAX_DEGREE are dropped
 SH_C0 = 0.28209479177387814  # basis function of band 0
 VARIANCE = 0.3  # px²: screen filter of 3DGS
 NEAR_FRACTION = 0.04  # default near plane, relative to the median distance of the means from their center
 MIP_VARIANCE = 0.1  # px², of files that only say `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
-MAX_VALUE = 1e15  # of the tables in LIMITED; viewers and codebooks fail beyond it
-LIMITED = ("log_scales", "sh_base", "sh_rest", MOTION)
+MAX_VALUE = 1e15  # of the tables in BOUNDED; viewers and codebooks fail beyond it
+BOUNDED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
 MIN_OUTSIDE = (
     0.5  # fraction of values outside of their range that shows another unit; mirrored axes have negative scales
@@ -255,26 +255,26 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
 
 def typical_size(means: NDArray[np.floating]) -> float:
     """Return the median distance of means, [N, 3], from their center, or the largest if that is 0, scene units."""
-    finite = means[np.isfinite(means).all(axis=1)].astype(np.float64)
-    distances = np.linalg.norm(finite - np.median(finite, axis=0), axis=1) if len(finite) else np.zeros(1)
+    valid = means[np.isfinite(means).all(axis=1)].astype(np.float64)
+    distances = np.linalg.norm(valid - np.median(valid, axis=0), axis=1) if len(valid) else np.zeros(1)
     return float(np.median(distances)) or float(distances.max()) or 1.0
 
 
-def usual_near(means: NDArray[np.floating]) -> float:
+def default_near(means: NDArray[np.floating]) -> float:
     """Return the default near plane for Gaussians with these means, [N, 3], scene units."""
     return NEAR_FRACTION * typical_size(means)
 
 
 def exceeds_limit(parameters: Parameters) -> NDArray[np.bool_]:
     """Return a mask, [N], of the Gaussians with finite log scales, SH coefficients, or motions beyond MAX_VALUE."""
-    return np.asarray(np.any([_row_exceeds_limit(parameters[name]) for name in LIMITED if name in parameters], axis=0))
+    return np.asarray(np.any([_row_exceeds_limit(parameters[name]) for name in BOUNDED if name in parameters], axis=0))
 
 
 def too_large_message(parameters: Parameters) -> str:
     """Describe how many Gaussians have values that are too large, and in which tables; '' if there are none."""
     if not (count := int(exceeds_limit(parameters).sum())):
         return ""
-    names = ", ".join(name for name in LIMITED if name in parameters and _row_exceeds_limit(parameters[name]).any())
+    names = ", ".join(name for name in BOUNDED if name in parameters and _row_exceeds_limit(parameters[name]).any())
     return f"{count:,} of {len(parameters['means']):,} Gaussians have {names} beyond {MAX_VALUE:g}"
 
 
@@ -291,8 +291,8 @@ def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
     if not (count := int((is_infinite.any(axis=1) | is_flat.any(axis=1)).sum())):
         return splats
     if not options.quiet:
-        fault = f"{count:,} Gaussians have an opacity of 0 or 1, or a scale of 0, without a finite logit or logarithm"
-        LOG.warning("%s: %s; they are moved by %g", path, fault, MIN_ALPHA)
+        fault = f"{count:,} Gaussians have an opacity of 0 or 1, or a scale of 0, whose logit or logarithm is infinite"
+        LOG.warning("%s: %s; their opacities or scales are changed by %g", path, fault, MIN_ALPHA)
     finite_logit = np.where(is_infinite, logits((logit > 0).astype(np.float32)), logit)
     finite_scales = np.where(is_flat, np.float32(FLAT_LOG_SCALE), log_scales)
     finite_tables = {"logit_opacity": finite_logit, "log_scales": finite_scales}
@@ -315,7 +315,7 @@ def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
     return logits(alpha)
 
 
-def apply_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
+def handle_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
     """Reject, drop, or keep Gaussians with NaN or infinity, depending on `options.not_finite`.
 
     "drop" also drops Gaussians with values that are too large, or with quaternions of length 0.  Raises DataError.
@@ -378,7 +378,7 @@ def require_memory(path: Path, count: int, degree: int = MAX_DEGREE) -> None:
 def warn_dropped(path: Path, degree: int) -> None:
     """Log a warning about SH bands beyond MAX_DEGREE, which readers drop."""
     if degree > MAX_DEGREE:
-        LOG.warning("%s: dropped the bands of SH degree %d", path, degree)
+        LOG.warning("%s: dropped the SH bands of degree %d", path, degree)
 
 
 def require_gaussians(path: Path, splats: SplatFile) -> None:

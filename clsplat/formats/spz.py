@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.reading import read_file, require_content
 from clsplat.formats.packing import (
+    exceeds_byte,
     from_smallest_three,
     morton_order,
-    outside_bytes,
     smallest_three,
     warn_clipped,
     write_bytes,
@@ -48,8 +48,8 @@ from clsplat.formats.sog_quantize import (
 from clsplat.formats.splats import (
     MAX_DEGREE,
     MAX_FILE,
+    MAX_STORED_DEGREE,
     PARAMETERS,
-    STORED_DEGREE,
     Parameters,
     Reading,
     SplatFile,
@@ -68,7 +68,7 @@ from clsplat.formats.splats import (
     warn_dropped,
 )
 
-# Encode and decode the planes of an SPZ file.
+# Pack and unpack the planes of an SPZ file.
 
 LOG = logging.getLogger("clsplat")
 MAGIC = b"NGSP"
@@ -81,9 +81,9 @@ COARSE, MAX_FRACTION = 2, 23  # models smaller than 2^-COARSE scene units get mo
 ROWS = 1 << 13  # rows decoded at once, to limit temporary memory
 # steps of SH coefficients, in levels of 256: for a Gaussian of median weight, typical and at most; at most for any
 MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
-LARGEST_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
+MAX_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
 # step of positions for a Gaussian of median weight, relative to its smallest scale
-SMALLEST_FRACTION = {"small": 0.5, "balanced": 0.5, "high": 0.0}
+POSITION_STEP = {"small": 0.5, "balanced": 0.5, "high": 0.0}
 # steps of colors, in levels of 255: for a Gaussian of median weight, and at most
 BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
 MAX_ZEROS = 16  # last bits of a position that may be zeroed
@@ -106,7 +106,7 @@ class SpzHeader:
         if len(data) < HEADER or data[:4] != MAGIC:
             raise DataError(f"{path}: not an SPZ file with a header of {HEADER} bytes; copy or export it again")
         version, count, degree, fraction, flags = struct.unpack_from("<2I3B", data, 4)
-        if not 1 <= version <= 4 or degree > STORED_DEGREE or fraction > 23:
+        if not 1 <= version <= 4 or degree > MAX_STORED_DEGREE or fraction > 23:
             raise DataError(
                 f"{path}: SPZ version {version}, SH degree {degree}, {fraction} fractional bits; expected version "
                 "1 to 4, degree 0 to 4, at most 23 bits; export it again"
@@ -120,7 +120,7 @@ class SpzHeader:
         return [self.count * width for width in (*widths, 3 * (sh_coefficients(self.degree) - 1))]
 
 
-def decode(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
+def unpack_planes(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
     """Decode the planes of a file.  planes: functions that return the next bytes of each plane, given their number."""
     byte = np.arange(256, dtype=np.float32)
     levels = {
@@ -138,7 +138,7 @@ def decode(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Param
             block = parameters[name][start : start + ROWS]
             data = np.frombuffer(plane(size // header.count * len(block)), np.uint8).reshape(len(block), -1)
             if name == "means":
-                block[:] = _positions(header, data)
+                block[:] = _unpack_positions(header, data)
             elif name == "quats":
                 block[:] = _unpack_3_byte_quats(data) if header.version < 3 else _unpack_4_byte_quats(data)
             else:
@@ -146,7 +146,7 @@ def decode(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Param
     return parameters
 
 
-def _positions(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _unpack_positions(header: SpzHeader, data: NDArray[np.uint8]) -> NDArray[np.float32]:
     if header.version == 1:
         return data.view("<f2").astype(np.float32)
     low, middle, high = data.reshape(-1, 3).astype(np.int32).T
@@ -173,25 +173,25 @@ def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) 
 
     Raises DataError if positions do not fit even without fractional bits.
     """
-    largest = float(np.abs(means).max(initial=0))
+    max_value = float(np.abs(means).max(initial=0))
     extra_bits = max(0, round(-math.log2(typical_size(means))) - COARSE)  # for models in a large unit of length
     target_bits = min((FINE_FRACTION if is_fine else FRACTION) + extra_bits, MAX_FRACTION)
-    bits = min(target_bits, math.floor(math.log2(MAX_INT24 / max(largest, 1e-9))))
+    bits = min(target_bits, math.floor(math.log2(MAX_INT24 / max(max_value, 1e-9))))
     if bits < 0:
-        raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model has {largest:g}; crop it")
+        raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model has {max_value:g}; crop it")
     if bits < min(FRACTION + extra_bits, MAX_FRACTION):
         LOG.warning(
             "%s: because of its largest coordinate, %g, SPZ rounds all positions to %.3g instead of %.3g scene units; "
             "crop the model for more precision",
             path,
-            largest,
+            max_value,
             2.0**-bits,
             2.0**-target_bits,
         )
     return bits
 
 
-def encode(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: int, options: Writing) -> list[bytes]:
+def pack_planes(path: Path, p: Parameters, weights: NDArray[np.float64], bits: int, options: Writing) -> list[bytes]:
     """Return the bytes of the planes.  Values outside their range are clipped, with a warning.
 
     weights: base-2 logarithms, [N], from `log_weights`.  Gaussians with fine SH steps come first, because
@@ -207,12 +207,12 @@ def encode(path: Path, p: Parameters, weights: NDArray[np.float64], fraction: in
         "scales": 16 * (p["log_scales"].astype(np.float64) + 10),
     }
     warn_clipped(path, "SPZ", "SH coefficients from -1 to 1", np.abs(p["sh_rest"]) > 1)
-    warn_clipped(path, "SPZ", "colors from -0.44 to 1.44", outside_bytes(levels["colors"]))
-    warn_clipped(path, "SPZ", "scales from 4.5e-05 to 379", outside_bytes(levels["scales"]))
+    warn_clipped(path, "SPZ", "colors from -0.44 to 1.44", exceeds_byte(levels["colors"]))
+    warn_clipped(path, "SPZ", "scales from 4.5e-05 to 379", exceeds_byte(levels["scales"]))
     step = quantization_steps(weights, *BASE_STEP[options.quality])[:, None]
     levels["colors"] = np.rint(levels["colors"] / step) * step
     alphas, colors, scales = (np.clip(np.rint(v), 0, 255).astype(np.uint8).tobytes() for v in levels.values())
-    positions = _encode_positions(p, weights, fraction, SMALLEST_FRACTION[options.quality])
+    positions = _encode_positions(p, weights, bits, POSITION_STEP[options.quality])
     rotations = _encode_rotations(p["quats"], QUAT_STEP[options.quality])
     return [positions, alphas, colors, scales, rotations, harmonics.tobytes()]
 
@@ -231,11 +231,11 @@ def _encode_positions(p: Parameters, weights: NDArray[np.float64], fraction: int
 
 def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
     """Encode the three smallest components of quaternions in 9 bits each, as multiples of `step`, with signs."""
-    largest, components = smallest_three(np.roll(unit(quats), -1, axis=1))
+    largest_index, components = smallest_three(np.roll(unit(quats), -1, axis=1))
     multiples = np.rint(511 / step * np.abs(components) * 2**0.5) * step
     levels = np.minimum(multiples, 511).astype(np.uint32)
     levels |= (components < 0).astype(np.uint32) << np.uint32(9)
-    rotations = largest.astype(np.uint32) << np.uint32(30)
+    rotations = largest_index.astype(np.uint32) << np.uint32(30)
     for i, shift in enumerate((20, 10, 0)):
         rotations |= levels[:, i] << np.uint32(shift)
     return rotations.astype("<u4").tobytes()
@@ -243,7 +243,7 @@ def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
 
 def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: Writing) -> NDArray[np.float32]:
     """Return the rounding step of each Gaussian's SH, [N], in levels of 1/128; all steps are 1 for quality `high`."""
-    max_step = LARGEST_STEP[options.quality]
+    max_step = MAX_STEP[options.quality]
     if max_step == 1 or not rest.shape[1]:
         return np.ones(len(rest), np.float32)
     return quantization_steps(weights, scaled_step(rest, *MEDIAN_STEP[options.quality]), max_step)
@@ -315,8 +315,8 @@ WRITTEN_VERSION = 3  # more programs read it than version 4
 HEADER4 = 32  # bytes, in version 4
 LEVEL = 12  # of deflate
 CODE_RATIO = 1032  # largest compression ratio of deflate
-RATIO = 32  # largest accepted compression ratio; real files have less than 8
-MIN_LIMIT = 1 << 26  # bytes of planes that a file of any size may decode to: 0.3 GB in memory
+MAX_RATIO = 32  # largest accepted compression ratio; real files have less than 8
+MIN_LIMIT = 1 << 26  # bytes of planes that a file of any size may decompress to: 0.3 GB in memory
 BLOCK = 1 << 16  # bytes read at once
 GZIP_START = b"\x1f\x8b\x08\0\0\0\0\0\2\xff"  # no time or system, so that the same model is written as the same bytes
 AXES_RECORD = 0xADBE0003  # an extension of Adobe; it contains 1 + the index of a name in AXES, or 0
@@ -360,7 +360,7 @@ def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
     p = splats.rows(morton_order(splats.parameters["means"])).parameters
     weights = log_weights(p, splats.has_sky)
     fraction = choose_fraction_bits(path, p["means"], options.quality == "high")
-    planes = encode(path, flip_axes(p), weights, fraction, options)
+    planes = pack_planes(path, flip_axes(p), weights, fraction, options)
     header_values = (WRITTEN_VERSION, len(splats), splats.sh_degree, fraction, MIP if splats.mode == "mip" else 0)
     return write_bytes(path, _gzip(MAGIC + struct.pack("<2I4B", *header_values, 0) + b"".join(planes)))
 
@@ -375,7 +375,7 @@ def _gzip(data: bytes) -> bytes:
 
 def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     """Decode the header, parameters, and declared axes of a file of version 1 to 3, compressed with gzip or not."""
-    stream = io.BytesIO(data) if data[:4] == MAGIC else _Gzip(path, data)
+    stream = io.BytesIO(data) if data[:4] == MAGIC else _GzipReader(path, data)
     start = stream.read(HEADER)
     if start[:3] == b"ply":
         require_content(path, data)  # says that it is compressed
@@ -390,16 +390,16 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
             raise DataError(f"{path}: too short: {header.count} splats take {expected} bytes; copy or export it again")
         return part
 
-    parameters = decode(header, [read] * len(header.sizes))
+    parameters = unpack_planes(header, [read] * len(header.sizes))
     axes = _read_axes(path, stream.read) if header.flags & EXTENSIONS else ""
     if stream.read(1):
         raise DataError(f"{path}: has data after its {header.count} splats; copy or export it again")
-    if isinstance(stream, _Gzip):
+    if isinstance(stream, _GzipReader):
         stream.require_end()
     return header, parameters, axes
 
 
-class _Gzip:
+class _GzipReader:
     """The decompressed content of a gzip file, read in parts.  Reading raises DataError if a member is damaged."""
 
     def __init__(self, path: Path, data: bytes) -> None:
@@ -464,12 +464,12 @@ def _decode_version_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, s
         start += length
     if start != len(data):
         raise DataError(f"{path}: has data after its last stream, at byte {start}; copy or export it again")
-    return header, decode(header, [frame.read for frame in frames]), axes
+    return header, unpack_planes(header, [frame.read for frame in frames]), axes
 
 
 def _max_decoded_size(data: bytes) -> int:
     """Return the accepted maximum size, in bytes, of the decompressed planes of a file."""
-    return max(len(data) * RATIO, MIN_LIMIT)
+    return max(len(data) * MAX_RATIO, MIN_LIMIT)
 
 
 def _check_size(path: Path, header: SpzHeader, limit: int) -> None:
@@ -486,15 +486,15 @@ def _read_axes(path: Path, read: Callable[[int], bytes]) -> str:
     """Return the declared axes, or ''.  Other extensions are skipped, as in Niantic's library.  Raises DataError."""
     axes = ""
     while len(record := read(8)) == 8:
-        kind, length = struct.unpack("<2I", record)
-        if kind == AXES_RECORD:
+        record_type, length = struct.unpack("<2I", record)
+        if record_type == AXES_RECORD:
             data = read(4) if length == 4 else b""
-            if len(data) < 4 or (number := int.from_bytes(data, "little")) > len(AXES):
+            if len(data) < 4 or (index := int.from_bytes(data, "little")) > len(AXES):
                 raise DataError(
                     f"{path}: its axes record has {length} bytes, {data.hex() or 'nothing'}; expected 4 bytes "
                     f"with a number from 0 to {len(AXES)}; export it again"
                 )
-            axes = AXES[number - 1] if number else ""
+            axes = AXES[index - 1] if index else ""
             continue
         while length and (part := read(min(length, BLOCK))):
             length -= len(part)

@@ -20,7 +20,7 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.files import invalid_name_reason, is_inside
 from clsplat.core.reading import read_json
 from clsplat.formats.packing import morton_order, write_bytes
-from clsplat.formats.sog import MAX_META, META, read_sog, require_plausible, sog_folder_files, write_as_ordered
+from clsplat.formats.sog import MAX_META, META, read_sog, require_plausible, sog_folder_files, write_ordered_sog
 from clsplat.formats.sog_quantize import log_weights
 from clsplat.formats.splats import (
     Parameters,
@@ -35,8 +35,8 @@ from clsplat.formats.splats import (
 
 LOD_META = "lod-meta.json"
 MAX_LEVELS = 64  # programs write about ten
-Run = tuple[int, int]  # offset and count of a leaf's splats in a file
-Runs = dict[int, list[Run]]  # of one level, ascending, by file number
+RowRange = tuple[int, int]  # offset and count of a leaf's splats in a file
+RangesByFile = dict[int, list[RowRange]]  # of one level, ascending, by file number
 
 
 def looks_like_lod(data: bytes) -> bool:
@@ -46,8 +46,8 @@ def looks_like_lod(data: bytes) -> bool:
 
 def read_lod(path: Path) -> SplatFile:
     """Read the finest level of a lod-meta.json and its environment.  Raises DataError if it is damaged."""
-    meta = _meta(path)
-    runs = _runs(path, meta)[0]
+    meta = _read_meta(path)
+    runs = _row_ranges(path, meta)[0]
     if not runs:
         raise DataError(f"{path}: its leaves have no file of level 0; export it again")
     count = sum(count for leaves in runs.values() for _, count in leaves)
@@ -61,19 +61,19 @@ def read_lod(path: Path) -> SplatFile:
 
 def find_level_faults(path: Path) -> list[str]:
     """Return a message for each missing or damaged file of the coarser levels; `read_lod` checks the finest level."""
-    meta, faults = _meta(path), []
-    levels = _runs(path, meta)
-    unused_files: Runs = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
+    meta, faults = _read_meta(path), []
+    levels = _row_ranges(path, meta)
+    unused_files: RangesByFile = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
     for level, runs in enumerate(levels):
         try:
-            faults += _faults(path, meta, runs) if level else []
+            faults += _find_faults(path, meta, runs) if level else []
             _require_count(path, meta, level, runs)
         except DataError as error:
             faults.append(str(error))
-    return faults + _faults(path, meta, unused_files)
+    return faults + _find_faults(path, meta, unused_files)
 
 
-def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
+def _find_faults(path: Path, meta: dict[str, Any], runs: RangesByFile) -> list[str]:
     """Return an error message for each missing or damaged file.  runs: row ranges of leaves, by file number."""
     faults = []
     for file, leaves in sorted(runs.items()):
@@ -86,13 +86,13 @@ def _faults(path: Path, meta: dict[str, Any], runs: Runs) -> list[str]:
 
 def lod_files(path: Path) -> list[Path]:
     """Return the paths of a lod-meta.json and of all files of its levels."""
-    meta = _meta(path)
+    meta = _read_meta(path)
     names = [*meta["filenames"], *([meta["environment"]] if "environment" in meta else [])]
     metas = [path.parent / _check_name(path, name) for name in names]
     return [path, *(file for meta in metas for file in sog_folder_files(meta))]
 
 
-def _meta(path: Path) -> dict[str, Any]:
+def _read_meta(path: Path) -> dict[str, Any]:
     meta = read_json(path, "a lod-meta.json", limit=MAX_META)
     if not isinstance(meta, dict) or meta.get("version") != 1:
         version = quote(meta.get("version") if isinstance(meta, dict) else meta)
@@ -124,25 +124,25 @@ def _is_meta_below(name: str) -> bool:
     return is_inside(name) and path.name == META and "\\" not in name and not any(map(invalid_name_reason, path.parts))
 
 
-def _runs(path: Path, meta: dict[str, Any]) -> list[Runs]:
+def _row_ranges(path: Path, meta: dict[str, Any]) -> list[RangesByFile]:
     """Return the row ranges of the leaves in each file, for each level.  Raises DataError for a damaged leaf."""
-    levels: list[Runs] = [{} for _ in meta["counts"]]
-    numbers = {str(level): level for level in range(len(levels))}
+    levels: list[RangesByFile] = [{} for _ in meta["counts"]]
+    level_by_name = {str(level): level for level in range(len(levels))}
     for leaf in _leaves(path, meta.get("tree")):
         for name, run in leaf.items():
-            if name not in numbers:
+            if name not in level_by_name:
                 raise DataError(
                     f"{path}: a leaf refers to level {quote(name)}; expected 0 to {len(levels) - 1}; export it again"
                 )
             file, offset, count = (_parse_integer(path, key, run) for key in ("file", "offset", "count"))
-            levels[numbers[name]].setdefault(file, []).append((offset, count))
+            levels[level_by_name[name]].setdefault(file, []).append((offset, count))
     for level, runs in enumerate(levels):
         if max(runs, default=-1) >= len(meta["filenames"]):
             raise DataError(f"{path}: a leaf refers to a missing file of level {level}; export it again")
     return [{file: sorted(leaves) for file, leaves in runs.items()} for runs in levels]
 
 
-def _require_count(path: Path, meta: dict[str, Any], level: int, runs: Runs) -> None:
+def _require_count(path: Path, meta: dict[str, Any], level: int, runs: RangesByFile) -> None:
     count, expected = sum(count for leaves in runs.values() for _, count in leaves), meta["counts"][level]
     if count != expected:
         raise DataError(
@@ -171,7 +171,7 @@ def _parse_integer(path: Path, key: str, run: Any) -> int:
     return value
 
 
-def _read_splats(path: Path, name: str, runs: list[Run]) -> SplatFile:
+def _read_splats(path: Path, name: str, runs: list[RowRange]) -> SplatFile:
     """Return the splats of a file that belong to leaves.  runs: row ranges in ascending order."""
     splats = read_sog(path.parent / name)
     rows, end = [np.arange(0)], 0
@@ -198,8 +198,8 @@ class LeafLimits:
     """The limits of a leaf; the defaults are those of PlayCanvas."""
 
     splats: int = 512 * 1024  # of all levels; a file exceeds it by one leaf at most
-    extent: float = 4.0  # max_extent side of the bounding box of means, in typical sizes: 16 scene units at a size of 4
-    few: int = 1024  # splats that are never split because of their extent
+    extent: float = 4.0  # longest side of the box of the means, in typical sizes: 16 scene units at a size of 4
+    min_splats: int = 1024  # leaves with no more splats are not split because of their extent
 
 
 @dataclass(frozen=True)
@@ -219,27 +219,27 @@ class Node:
             yield from child.leaves()
 
 
-def tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
+def build_tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
     """Build the tree of all levels, which start with the finest and are not empty."""
     means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
     reach, max_extent = np.concatenate([half_boxes(level) for level in levels]), limits.extent * typical_size(means)
     starts = np.cumsum([0, *(len(level["means"]) for level in levels)])
 
-    def node(rows: Rows) -> Node:
+    def build_node(rows: Rows) -> Node:
         span = np.ptp(means[rows], axis=0)
-        if len(rows) > limits.splats or (span.max() > max_extent and len(rows) > limits.few):
+        if len(rows) > limits.splats or (span.max() > max_extent and len(rows) > limits.min_splats):
             sorted_rows = rows[np.argsort(means[rows, int(span.argmax())], kind="stable")]
-            halves = node(sorted_rows[: len(rows) // 2]), node(sorted_rows[len(rows) // 2 :])
+            halves = build_node(sorted_rows[: len(rows) // 2]), build_node(sorted_rows[len(rows) // 2 :])
             low = np.minimum(*(half.low for half in halves))
             return Node(low, np.maximum(*(half.high for half in halves)), halves)
         low, high = (means[rows] - reach[rows]).min(axis=0), (means[rows] + reach[rows]).max(axis=0)
-        return Node(low, high, rows=tuple(by_level(np.sort(rows))))
+        return Node(low, high, rows=tuple(split_levels(np.sort(rows))))
 
-    def by_level(rows: Rows) -> Iterator[Rows]:
+    def split_levels(rows: Rows) -> Iterator[Rows]:
         for part, start in zip(np.split(rows, np.searchsorted(rows, starts[1:-1])), starts, strict=False):
             yield part[morton_order(means[part])] - start
 
-    return node(np.arange(len(means)))
+    return build_node(np.arange(len(means)))
 
 
 def half_boxes(level: Parameters) -> Floats:
@@ -267,9 +267,9 @@ def write_lod(
     for level in levels:
         require_gaussians(folder / LOD_META, level)
         require_in_range(folder / LOD_META, level, "SOG")
-    root = tree([level.parameters for level in levels], limits)
-    files = _Files(limits.splats)
-    shape = files.shape(root)
+    root = build_tree([level.parameters for level in levels], limits)
+    files = _FileList(limits.splats)
+    root_data = files.to_json(root)
     counts = [len(level) for level in levels]
     meta = {
         "version": 1,
@@ -278,39 +278,39 @@ def write_lod(
         "counts": counts,
         "lodLevels": len(levels),
         "filenames": list(files.rows),
-        "tree": shape,
+        "tree": root_data,
     }
     weights = [log_weights(level.parameters, level.has_sky) for level in levels]
-    for name, (number, parts) in files.rows.items():
+    for name, (index, parts) in files.rows.items():
         rows = np.concatenate(parts)
-        write_as_ordered(folder / name, levels[number].rows(rows), weights[number][rows], options or Writing())
+        write_ordered_sog(folder / name, levels[index].rows(rows), weights[index][rows], options or Writing())
     return write_bytes(folder / LOD_META, json.dumps(meta, separators=(",", ":"), allow_nan=False).encode())
 
 
 @dataclass
-class _Files:
+class _FileList:
     """The files of all levels.  Leaves are added to a file until it has more than `splats` splats."""
 
     splats: int
     rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: the level, and runs of its rows
-    open: dict[int, int] = field(default_factory=dict)  # by level, the number of the file for the next leaf
+    next_file: dict[int, int] = field(default_factory=dict)  # by level, the number of the file for the next leaf
 
-    def shape(self, node: Node) -> dict[str, Any]:
+    def to_json(self, node: Node) -> dict[str, Any]:
         """Return a node as JSON data, and assign the rows of its leaves to files."""
         bound = {"bound": {"min": _round(node.low), "max": _round(node.high)}}
         if node.children:
-            return {**bound, "children": [self.shape(child) for child in node.children]}
+            return {**bound, "children": [self.to_json(child) for child in node.children]}
         lods = {str(level): self._run(level, rows) for level, rows in enumerate(node.rows) if len(rows)}
         return {**bound, "lods": lods}
 
     def _run(self, level: int, rows: Rows) -> dict[str, int]:
-        number = self.open.setdefault(level, 0)
+        number = self.next_file.setdefault(level, 0)
         name = f"{level}_{number}/{META}"
         runs = self.rows.setdefault(name, (level, []))[1]
         offset = sum(map(len, runs))
         runs.append(rows)
         if offset + len(rows) > self.splats:
-            self.open[level] += 1
+            self.next_file[level] += 1
         return {"file": list(self.rows).index(name), "offset": offset, "count": len(rows)}
 
 

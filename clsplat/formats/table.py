@@ -22,11 +22,11 @@ from clsplat.formats.splats import (
     Reading,
     SplatFile,
     Writing,
-    apply_not_finite,
     clamp_limits,
+    default_near,
+    handle_not_finite,
     not_finite,
     require_static,
-    usual_near,
 )
 from clsplat.formats.spz import read_spz, write_spz
 from clsplat.formats.streamed_sog import LOD_META, lod_files, looks_like_lod, read_lod
@@ -194,33 +194,33 @@ def detect(path: Path) -> Codec | None:
     """
     with open_file(path, "a model file") as file:
         start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
-    named_codec = format_of_name(path)
+    named_codec = format_from_name(path)
     codec = next((c for c in CODECS if c.matches(start) and (c.has_magic or named_codec in (None, c))), None)
     if codec is None or not start.size:
         require_content(path, start.data)
     return codec
 
 
-def format_of_name(path: Path) -> Codec | None:
+def format_from_name(path: Path) -> Codec | None:
     """Return the format with the longest ending that matches a file name, or None."""
     name = path.name.lower()
     pairs = [(end, codec) for codec in CODECS for end in codec.endings]
-    matching = [(end, codec) for end, codec in pairs if name == end or (end.startswith(".") and name.endswith(end))]
-    return max(matching, key=lambda pair: len(pair[0]))[1] if matching else None
+    matches = [(end, codec) for end, codec in pairs if name == end or (end.startswith(".") and name.endswith(end))]
+    return max(matches, key=lambda pair: len(pair[0]))[1] if matches else None
 
 
 def read(path: Path, options: Reading | None = None) -> SplatFile:
     """Read a model file of any format.  Raises DataError if it is missing, damaged, or of an unknown format."""
     options = options or Reading()
     path = model_file(path)
-    codec = detect(path) or format_of_name(path)  # the reader of the named format reports what is wrong
+    codec = detect(path) or format_from_name(path)  # the reader of the named format reports what is wrong
     if codec is None:
         known_endings = ", ".join(endings(reads=True))
         raise DataError(f"{path}: unknown model format; expected one of {known_endings}")
     if codec.read is None:
         raise DataError(f"{path}: {codec.name} can be written but not read; convert the model it was created from")
     with np.errstate(all="ignore"):  # values that are not finite are handled below
-        return apply_not_finite(path, clamp_limits(path, codec.read(path, options), options), options)
+        return handle_not_finite(path, clamp_limits(path, codec.read(path, options), options), options)
 
 
 def writing_format(path: Path) -> Codec:
@@ -230,7 +230,7 @@ def writing_format(path: Path) -> Codec:
     """
     if not path.name:
         raise OutputError(f"{path}: cannot be written (it has no file name); use the path of a file")
-    codec = format_of_name(path)
+    codec = format_from_name(path)
     if codec is None or codec.write is None:
         remedy = f"is only written by `{codec.command}`" if codec and codec.command else "can be read but not written"
         fault = f"{codec.name} {remedy}" if codec else f"no format has the name {quote(path.name)}"
@@ -282,13 +282,13 @@ def warn_about_losses(path: Path, splats: SplatFile) -> None:
         )
 
 
-USUAL = 10  # a near plane within this factor of the default is not worth a warning
+FACTOR = 10  # a near plane within this factor of the default needs no warning
 
 
 def _unusual_settings(splats: SplatFile) -> str:
     """Describe the rendering settings that differ from the defaults for files without them."""
-    near, default = splats.rendering.get("near"), usual_near(splats.parameters["means"])
-    usual: dict[str, Any] = {} if near and default / USUAL < near < default * USUAL else {"near": near and default}
+    near, default = splats.rendering.get("near"), default_near(splats.parameters["means"])
+    usual: dict[str, Any] = {} if near and default / FACTOR < near < default * FACTOR else {"near": near and default}
     usual |= {"screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None, "pixel_box": 0}
     values = {name: splats.rendering.get(name, value) for name, value in usual.items()}
     return ", ".join(f"{name} = {value}" for name, value in values.items() if value != usual[name])

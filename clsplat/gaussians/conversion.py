@@ -30,7 +30,7 @@ from clsplat.formats.splats import (
     sh_coefficients,
     with_degree,
 )
-from clsplat.formats.table import format_of_name, model_bytes, writing_format
+from clsplat.formats.table import format_from_name, model_bytes, writing_format
 from clsplat.gaussians.model import Model, exported_model, load, model_path
 from clsplat.gaussians.motion import static_motion, with_motion
 from clsplat.gaussians.sky import sample_texels, sky_path
@@ -354,7 +354,7 @@ def _require_no_other_frames(folder: Path, pattern: re.Pattern[str], files: Sequ
 
 def _split_name(out: Path) -> tuple[Path, str, str]:
     """Return the folder of frames, and the text before and after the number in their names."""
-    if format_of_name(out) is None and out.suffix == "":
+    if format_from_name(out) is None and out.suffix == "":
         return out, "", ".ply"
     codec = writing_format(out)
     ending = next((end for end in sorted(codec.endings, key=len, reverse=True) if out.name.lower().endswith(end)), "")

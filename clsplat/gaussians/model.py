@@ -14,7 +14,7 @@ from clsplat.core.files import METRICS, is_inside
 from clsplat.core.reading import read_json
 from clsplat.formats import splats as columns
 from clsplat.formats.ply import MAX_NUMBER
-from clsplat.formats.sog_quantize import before_gap
+from clsplat.formats.sog_quantize import is_before_gap
 from clsplat.formats.splats import (
     MAX_DEGREE,
     MAX_EXPONENT,
@@ -28,12 +28,12 @@ from clsplat.formats.splats import (
     SplatFile,
     Writing,
     columns_to_sh_degree,
+    default_near,
     inverse_opacities,
     not_finite,
     opacities,
     sh_coefficients,
     transform,
-    usual_near,
 )
 from clsplat.formats.table import model_file, read, write, writing_format
 from clsplat.gaussians.gaussians import DeviceModel, Gaussians
@@ -202,12 +202,12 @@ class Model:
         if self.rendering.notes.get("sky") != "splats":
             return self.means
         means = self.means.astype(np.float64)
-        return self.means[before_gap(np.linalg.norm(means - np.median(means, axis=0), axis=1))]
+        return self.means[is_before_gap(np.linalg.norm(means - np.median(means, axis=0), axis=1))]
 
     @property
     def near(self) -> float:
         """The near plane in scene units: `rendering.near`, or a fraction of the model's size if that is 0."""
-        return self.rendering.near or usual_near(self.means)
+        return self.rendering.near or default_near(self.means)
 
     @property
     def scales(self) -> Floats:

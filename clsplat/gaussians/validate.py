@@ -10,7 +10,7 @@ from clsplat.core.reading import open_file
 from clsplat.formats.ply import MAX_HEADER
 from clsplat.formats.splats import Reading, motion_fields, not_finite, too_large_message, typical_size
 from clsplat.formats.streamed_sog import LOD_META, find_level_faults
-from clsplat.formats.table import detect, format_of_name, model_file
+from clsplat.formats.table import detect, format_from_name, model_file
 from clsplat.gaussians.model import Model, load
 from clsplat.scene.scene import format_position
 
@@ -28,7 +28,7 @@ def is_model(path: Path) -> bool:
     file = model_file(path)
     if file.suffix in (".yaml", ".yml"):
         return False
-    if format_of_name(file) or file.suffix.lower() in UNSUPPORTED:
+    if format_from_name(file) or file.suffix.lower() in UNSUPPORTED:
         return True
     return file.is_file() and (detect(file) is not None or _is_binary(file))
 

@@ -185,7 +185,7 @@ REFUSED = {
     "kernel": (change(["meshes", 0, "primitives", 0, "extensions", KHR, "kernel"], "box"), "kernel is 'box'"),
     "required extension": (
         change(["extensionsRequired"], [KHR, "KHR_materials_unlit", "EXT_mesh_gpu_instancing"]),
-        "requires 'EXT_mesh_gpu_instancing', which clsplat cannot read; export it again without them",
+        "requires 'EXT_mesh_gpu_instancing', which clsplat does not support; export it again without them",
     ),
     "web": (
         change(["buffers", 0, "uri"], "https://a.org/a.bin"),

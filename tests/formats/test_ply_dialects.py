@@ -140,4 +140,4 @@ def test_degree_four_of_a_ply_is_cut_to_three(tmp_path, rng, caplog):
     rows = np.concatenate([table[:, :9], wide, table[:, 54:]], axis=1)
     (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + rows.astype("<f4").tobytes())
     np.testing.assert_array_equal(read(tmp_path / "b.ply").parameters["sh_rest"].reshape(5, 15, 3), before)
-    assert caplog.messages == [f"{tmp_path / 'b.ply'}: dropped the bands of SH degree 4"]
+    assert caplog.messages == [f"{tmp_path / 'b.ply'}: dropped the SH bands of degree 4"]

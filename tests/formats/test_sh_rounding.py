@@ -11,10 +11,10 @@ from clsplat.core.harmonics import basis, mean_basis
 from clsplat.formats import sog_quantize
 from clsplat.formats.packing import morton_order
 from clsplat.formats.sog_quantize import (
-    LARGEST,
+    MAX_LOG_WEIGHT,
     SH_LEVELS,
-    before_gap,
     compensate_base,
+    is_before_gap,
     log_weights,
     quantization_steps,
     round_sh,
@@ -98,7 +98,7 @@ def test_model_without_sky_counts_all_gaussians(rng, tmp_path):
     directions, radii = rng.normal(size=(2300, 3)), np.append(rng.uniform(0, 0.1, 2000), rng.uniform(2, 3, 300))
     source.parameters["means"] = unit(np.pad(directions, ((0, 0), (1, 0))))[:, 1:] * radii[:, None].astype(np.float32)
     source.parameters["means"] = source.parameters["means"].astype(np.float32)
-    assert not before_gap(radii).all()
+    assert not is_before_gap(radii).all()
     assert abs(np.median(log_weights(source.parameters))) < 1e-9
     noted = replace(source, rendering={"sky": "splats"})
     for name in ("a.spz", "a.sog"):
@@ -116,13 +116,13 @@ def test_sky_is_recognized_in_a_converted_ply(rng, tmp_path):
 
 def test_all_gaussians_count_without_a_gap(rng):
     for power in (1, 2, 4):
-        assert before_gap(rng.uniform(0, 1, 2000) ** power).all()
+        assert is_before_gap(rng.uniform(0, 1, 2000) ** power).all()
     few = np.append(rng.uniform(0, 1, 980), rng.uniform(40, 50, 20))
-    assert before_gap(few).all(), "too few to decide a median"
-    assert before_gap(np.zeros(50)).all()
-    assert before_gap(np.array([0.0, 1.0])).all()
+    assert is_before_gap(few).all(), "too few to decide a median"
+    assert is_before_gap(np.zeros(50)).all()
+    assert is_before_gap(np.array([0.0, 1.0])).all()
     sky = np.append(rng.uniform(0, 1, 300), np.full(700, 10.0))
-    np.testing.assert_array_equal(before_gap(sky), sky < 5)
+    np.testing.assert_array_equal(is_before_gap(sky), sky < 5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50])
@@ -131,7 +131,7 @@ def test_weights_are_finite_of_any_model(count, rng):
     for name, value in (("logit_opacity", -1e30), ("logit_opacity", 1e30), ("log_scales", 1e15), ("means", 1e15)):
         p[name][: count // 2] = value
         assert np.isfinite(log_weights(p)).all()
-        assert (np.abs(log_weights(p)) <= LARGEST).all()
+        assert (np.abs(log_weights(p)) <= MAX_LOG_WEIGHT).all()
     p["means"][:] = 3
     assert np.isfinite(log_weights(p)).all()
 

@@ -18,7 +18,7 @@ import pytest
 
 from clsplat.core.errors import DataError, OutputError
 from clsplat.formats.packing import morton_order
-from clsplat.formats.palette import ENTRIES, codebook, nearest_entries, palette
+from clsplat.formats.palette import ENTRIES, fit_codebook, fit_palette, nearest_entries
 from clsplat.formats.splats import Writing
 from clsplat.formats.table import detect, read, write
 from tests.support.data_sets import data_set
@@ -136,14 +136,14 @@ def test_larger_palette_is_more_accurate(tmp_path, rng):
 
 def test_codebook_is_more_accurate_than_equal_steps(rng):
     values = rng.normal(size=20_000) ** 3
-    entries = codebook(values)
+    entries = fit_codebook(values)
     assert len(entries) == ENTRIES
     assert (np.diff(entries) >= 0).all()
     error = np.square(entries[nearest_entries(values, entries)] - values).mean()
     equal = np.linspace(values.min(), values.max(), ENTRIES)
     assert error < 0.2 * np.square(equal[nearest_entries(values, equal)] - values).mean()
     few = np.float32([3, 1, 2, 2])
-    np.testing.assert_array_equal(codebook(few)[nearest_entries(few, codebook(few))], few)
+    np.testing.assert_array_equal(fit_codebook(few)[nearest_entries(few, fit_codebook(few))], few)
 
 
 @pytest.mark.parametrize("far", [[-1e5] * 50, [1e8], [1e15, -1e15, 3e8]])
@@ -153,13 +153,13 @@ def test_outliers_barely_affect_other_values(far, rng):
     def error(entries):
         return np.square(entries[nearest_entries(values, entries)] - values).mean()
 
-    assert error(codebook(np.append(values, far))) < 2 * error(codebook(values))
+    assert error(fit_codebook(np.append(values, far))) < 2 * error(fit_codebook(values))
 
 
 def test_every_point_gets_its_nearest_integer_vector(rng):
     points = rng.integers(-511, 512, (400, 45)).astype(np.float32)
     points[0, 0] = 511
-    vectors, labels = palette(points, 32, np.ones(400))
+    vectors, labels = fit_palette(points, 32, np.ones(400))
     distance = np.square(points[:, None].astype(np.int64) - np.rint(vectors).astype(np.int64)).sum(axis=2)
     assert (distance[np.arange(400), labels] <= distance.min(axis=1) * 1.02).all()
     assert len(np.unique(labels)) > 28
@@ -172,7 +172,7 @@ def test_palette_is_more_accurate_for_heavier_points(rng):
     def error(actual):
         return (weights * np.square(actual[0][actual[1]] - points).sum(axis=1)).sum()
 
-    evenly, weighted = palette(points, 64, np.zeros(4000)), palette(points, 64, weights)
+    evenly, weighted = fit_palette(points, 64, np.zeros(4000)), fit_palette(points, 64, weights)
     assert error(weighted) < 0.8 * error(evenly)
 
 
@@ -181,11 +181,11 @@ def test_palette_does_not_depend_on_the_thread_count(rng):
     from clsplat.formats import palette as module
 
     points = rng.normal(size=(3000, 45)).astype(np.float32)
-    before = palette(points, 64, np.ones(3000))
+    before = fit_palette(points, 64, np.ones(3000))
     block = module.BLOCK
     try:
         module.BLOCK = 7  # other shapes take other paths through the library
-        after = palette(points, 64, np.ones(3000))
+        after = fit_palette(points, 64, np.ones(3000))
     finally:
         module.BLOCK = block
     np.testing.assert_array_equal(before[0], after[0])

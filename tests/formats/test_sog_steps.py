@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.formats.packing import morton_order
-from clsplat.formats.palette import ENTRIES, codebook
+from clsplat.formats.palette import ENTRIES, fit_codebook
 from clsplat.formats.sog_quantize import LEVELS, round_means, round_quats, round_to
 from clsplat.formats.splats import Writing, unit
 from clsplat.formats.table import write
@@ -47,11 +47,11 @@ def test_positions_without_extent_do_not_change(rng):
 
 def test_codebook_has_equal_steps_where_they_suffice(rng):
     values = rng.normal(size=5000)
-    entries = codebook(values, 0.1)
+    entries = fit_codebook(values, 0.1)
     np.testing.assert_allclose(np.rint(entries / 0.1) * 0.1, entries)
-    np.testing.assert_array_equal(codebook(entries, 0.07), entries)
-    fine = codebook(values, 1e-4)
-    np.testing.assert_array_equal(fine, codebook(values))
+    np.testing.assert_array_equal(fit_codebook(entries, 0.07), entries)
+    fine = fit_codebook(values, 1e-4)
+    np.testing.assert_array_equal(fine, fit_codebook(values))
     assert len(fine) == ENTRIES
 
 

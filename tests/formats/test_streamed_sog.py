@@ -14,7 +14,7 @@ from clsplat.core.files import new_folder
 from clsplat.formats import streamed_sog
 from clsplat.formats.packing import morton_order
 from clsplat.formats.splats import SplatFile, Writing, typical_size
-from clsplat.formats.streamed_sog import LeafLimits, half_boxes, tree, write_lod
+from clsplat.formats.streamed_sog import LeafLimits, build_tree, half_boxes, write_lod
 from clsplat.formats.table import detect, model_bytes, read, write
 from clsplat.gaussians.conversion import convert
 from clsplat.gaussians.model import load
@@ -24,7 +24,7 @@ from tests.support.models import assert_close, interop, splats
 from tests.support.runs import NO_PROCESS
 
 BOUND = (-13.10682, -4.463487, -3.914306), (10.55131, 2.742857, 14.0425)  # of its root
-SMALL = LeafLimits(splats=300, extent=4.0, few=50)
+SMALL = LeafLimits(splats=300, extent=4.0, min_splats=50)
 
 
 def levels(rng: np.random.Generator, counts: tuple[int, ...] = (700, 300, 100)) -> list[SplatFile]:
@@ -88,7 +88,7 @@ def test_finest_level_is_read_back(written):
         assert (result.mode, result.rendering) == ("mip", made[0].rendering)
         assert len(load(place)) == 700
     assert detect(folder / "lod-meta.json").name == "streamed SOG"
-    order = np.concatenate([leaf.rows[0] for leaf in tree([item.parameters for item in made], SMALL).leaves()])
+    order = np.concatenate([leaf.rows[0] for leaf in build_tree([item.parameters for item in made], SMALL).leaves()])
     close = {"means": 0.002, "log_scales": 0.1, "opacity": 0.0101, "sh_base": 0.1, "sh_rest": 0.5}
     assert_close(result, made[0].rows(order), 0.8, **close)
 
@@ -96,11 +96,11 @@ def test_finest_level_is_read_back(written):
 def test_too_large_leaves_are_divided(rng):
     parameters = splats(rng, 700).parameters
     for limits in (SMALL, LeafLimits(100, 1e9, 1), LeafLimits(1000, 1.0, 20)):
-        actual = list(tree([parameters], limits).leaves())
+        actual = list(build_tree([parameters], limits).leaves())
         for leaf in actual:
             span = np.ptp(parameters["means"][leaf.rows[0]], axis=0).max()
             assert len(leaf.rows[0]) <= limits.splats
-            assert span <= limits.extent * typical_size(parameters["means"]) or len(leaf.rows[0]) <= limits.few
+            assert span <= limits.extent * typical_size(parameters["means"]) or len(leaf.rows[0]) <= limits.min_splats
             np.testing.assert_array_equal(morton_order(parameters["means"][leaf.rows[0]]), np.arange(len(leaf.rows[0])))
         np.testing.assert_array_equal(np.sort(np.concatenate([leaf.rows[0] for leaf in actual])), np.arange(700))
 
