@@ -124,7 +124,7 @@ def test_positions_of_a_ksplat_are_relative_to_their_bucket(tmp_path):
 
 
 DAMAGED = {
-    "more splats than places": ({"count": 4}, "4 of 3 splats"),
+    "more splats than places": ({"count": 4}, "4 splats in 3 rows"),
     "degree": ({"degree": 3}, "SH degree 3"),
     "places": ({"rows": 3, "buckets": 10**6}, "truncated"),
     "empty buckets": ({"held": 2}, "have fewer splats"),

@@ -14,7 +14,7 @@ ROOMS = (  # from the top down; a room imports only from those below it
 TEXTS = {  # what turns results into lines of text, which the commands print
     "clsplat.conformance.doctor": {"check_html_path", "write_page"},
     "clsplat.core.text_table": {"text_table"},
-    "clsplat.gaussians.validate": {"lines", "verdict"},
+    "clsplat.gaussians.validate": {"format_report", "verdict"},
     "clsplat.pipeline.files": {"shipped_pipelines"},  # for completion, which must be fast
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.prepare.inspect.findings": {"show"},

@@ -89,7 +89,7 @@ def test_point_on_the_border_of_an_image_has_a_pixel_or_none(rng):
     edge = rng.choice([0, 225], len(depth))
     points = np.stack([np.zeros_like(depth), (edge - 112.5) / 555 * depth, depth], axis=1).astype(np.float32)
     place = silhouette.project(points)
-    assert 0 < place.inside.sum() < len(points), "rounding goes both ways"
+    assert 0 < place.is_inside.sum() < len(points), "rounding goes both ways"
     assert place.row.min() >= 0
     assert place.row.max() < 225
 

@@ -202,7 +202,7 @@ def test_device_holds_the_visible_part_of_host_harmonics(spread, tiny_scene, tmp
     gaussians = run.model.gaussians
     held = {name: table.array.nbytes for name, table in gaussians.tables.items()}
     assert set(gaussians.on_host.tables) == {"sh_rest", "adam/sh_rest/moment1", "adam/sh_rest/moment2"}
-    assert held["sh_rest"] == gaussians.on_host.block * 4 * gaussians.tables["sh_rest"].array.shape[0]
+    assert held["sh_rest"] == gaussians.on_host.block_size * 4 * gaussians.tables["sh_rest"].array.shape[0]
     assert 0 < len(gaussians.on_host.loaded_blocks) <= gaussians.tables["sh_rest"].array.shape[0]
 
 
