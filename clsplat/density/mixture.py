@@ -29,9 +29,9 @@ def surface(log_scales: Floats) -> Floats:
     return result
 
 
-def masses(tables: dict[str, Floats], size: Size = volume) -> Floats:
+def masses(tables: dict[str, Floats], size_of: Size = volume) -> Floats:
     """Return the mass of each Gaussian, its opacity times its size, [N]."""
-    mass: Floats = size(tables["log_scales"]) / inverse_opacities(tables["logit_opacity"][:, 0])
+    mass: Floats = size_of(tables["log_scales"]) / inverse_opacities(tables["logit_opacity"][:, 0])
     return mass
 
 
@@ -57,22 +57,22 @@ class Mixtures:
             covariance += weight[:, :, None] * (covariances + offset[:, :, None] * offset[:, None, :])
         return cls(total, fraction, means, covariance)
 
-    def opacity(self, log_scales: Floats, size: Size = volume) -> Floats:
+    def opacity(self, log_scales: Floats, size_of: Size = volume) -> Floats:
         """Return the opacities that preserve the mass, [pairs], clamped to MIN_OPACITY and MAX_OPACITY."""
-        return np.clip(self.mass / size(log_scales), MIN_OPACITY, MAX_OPACITY)
+        return np.clip(self.mass / size_of(log_scales), MIN_OPACITY, MAX_OPACITY)
 
 
-def merge(tables: dict[str, Floats], first: Rows, second: Rows, size: Size = volume) -> dict[str, Floats]:
+def merge(tables: dict[str, Floats], first: Rows, second: Rows, size_of: Size = volume) -> dict[str, Floats]:
     """Merge rows `first` and `second`, [pairs] each, into Gaussians with the mean and covariance of their mixtures.
 
     Returns tables of the shape [pairs, components], by parameter.
     """
-    mixtures = Mixtures.from_pairs(tables, masses(tables, size), first, second)
+    mixtures = Mixtures.from_pairs(tables, masses(tables, size_of), first, second)
     fraction = mixtures.fraction
     variances, axes = np.linalg.eigh(mixtures.covariance)  # scene units²
     log_scales = to_log_scales(variances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # a rotation, not a reflection
-    opacity = mixtures.opacity(log_scales, size)
+    opacity = mixtures.opacity(log_scales, size_of)
     harmonics = {name: tables[name] for name in ("sh_base", "sh_rest")}
     colors = {name: (1 - fraction) * table[first] + fraction * table[second] for name, table in harmonics.items()}
     return {

@@ -222,15 +222,15 @@ def undistorted_folder(out: Path) -> Path:
     return link / Owner.current().host_slug if is_store_link else out / UNDISTORTED
 
 
-def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:
+def make_run(pipeline: Pipeline, run_scene: RunScene, device: Device, out: Path, status: StatusFile) -> Run:
     """Create the run of a pipeline on a scene, in the state before its first stage."""
-    pipeline = with_lengths(pipeline, scene.scene)
+    pipeline = with_lengths(pipeline, run_scene.scene)
     settings = pipeline.settings
     budget = None if settings.scene.image_budget is None else settings.scene.image_budget << 20
     return Run(
         device=device,
-        scene=scene.scene,
-        original=scene.original,
+        scene=run_scene.scene,
+        original=run_scene.original,
         out=out,
         name=settings.name,
         seed=settings.seed,
@@ -238,10 +238,10 @@ def make_run(pipeline: Pipeline, scene: RunScene, device: Device, out: Path, sta
         pipeline=pipeline.resolved(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.limits()),
         harmonics=settings.harmonics,
-        photographs=Photographs(device, scene.background, budget, undistorted_folder(out)),
+        photographs=Photographs(device, run_scene.background, budget, undistorted_folder(out)),
         status=status,
         model_settings=settings.model,
-        identity=scene.identity,
+        identity=run_scene.identity,
         file_hashes=content_hashes(pipeline),
     )
 

@@ -9,7 +9,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.runs.live import server as module
-from clsplat.runs.live.preview import MAX_WAITING, Credit, EncodedPicture, PreviewRequest, RequestQueue
+from clsplat.runs.live.preview import MAX_WAITING, Credit, EncodedImage, PreviewRequest, RequestQueue
 from clsplat.runs.live.server import Response, Server
 
 
@@ -151,7 +151,7 @@ def asked(queue: RequestQueue, *wanted: PreviewRequest) -> list[threading.Thread
 
 
 def test_moving_requests_take_precedence_and_the_queue_is_short():
-    queue, picture = RequestQueue(), EncodedPicture(b"", 1)
+    queue, picture = RequestQueue(), EncodedImage(b"", 1)
     wanted = [PreviewRequest(page, None, "again" if page < 2 else "moving") for page in range(MAX_WAITING)]
     threads = asked(queue, *wanted)
     assert not queue.wait_for(PreviewRequest(99, None, "moving"), 0)
@@ -168,14 +168,14 @@ def test_new_request_replaces_the_pages_previous_one():
     (thread,) = asked(queue, first)
     others = asked(queue, second)
     thread.join(5)
-    assert first.picture is None
+    assert first.image is None
     assert queue.first() is second
-    queue.deliver(second, EncodedPicture(b"x", 2))
+    queue.deliver(second, EncodedImage(b"x", 2))
     others[0].join(5)
 
 
 def test_request_times_out():
     queue, request = RequestQueue(), PreviewRequest(1, None, "moving")
     assert queue.wait_for(request, 0)
-    assert request.picture is None
+    assert request.image is None
     assert not queue

@@ -34,7 +34,7 @@ Pace = Literal["moving", "still", "again"]  # the camera moves, has just stopped
 
 
 @dataclass(frozen=True)
-class EncodedPicture:
+class EncodedImage:
     """An encoded image, and the training step that it shows."""
 
     jpeg: bytes
@@ -49,7 +49,7 @@ class PreviewRequest:
     view: View
     pace: Pace
     done: threading.Event = field(default_factory=threading.Event)
-    picture: EncodedPicture | None = None
+    image: EncodedImage | None = None
 
 
 class RequestQueue:
@@ -62,7 +62,7 @@ class RequestQueue:
     def wait_for(self, request: PreviewRequest, seconds: float) -> bool:
         """Add a request, which replaces an earlier request of the same page, and wait for its preview.
 
-        Returns False if the queue is full.  After a timeout, `request.picture` is None.
+        Returns False if the queue is full.  After a timeout, `request.image` is None.
         """
         with self._changed:
             earlier = next((other for other in self._requests if other.page == request.page), None)
@@ -87,10 +87,10 @@ class RequestQueue:
         with self._changed:
             return min(self._requests, key=lambda request: request.pace == "again", default=None)
 
-    def deliver(self, request: PreviewRequest, picture: EncodedPicture | None) -> None:
+    def deliver(self, request: PreviewRequest, image: EncodedImage | None) -> None:
         """Remove a request from the queue, and pass the image, or None, to the thread that waits for it."""
         self._drop(request)
-        request.picture = picture
+        request.image = image
         request.done.set()
 
     def wait(self, seconds: float) -> None:
@@ -128,7 +128,7 @@ class Preview:
         """Return the estimated time of the next preview, s."""
         return self._estimate(self._side(pace))
 
-    def draw(self, request: PreviewRequest) -> EncodedPicture:
+    def draw(self, request: PreviewRequest) -> EncodedImage:
         """Render a preview.  Raises MemoryLimitError if the training leaves no device memory."""
         side, rasterizer = self._side(request.pace), self._open_rasterizer()
         start_time = time.perf_counter()
@@ -137,7 +137,7 @@ class Preview:
         image = render_view(self.run.painter(rasterizer), camera)
         jpeg = encode_jpeg(image, QUALITY)
         self._costs[side] = time.perf_counter() - start_time
-        return EncodedPicture(jpeg, self.run.step)
+        return EncodedImage(jpeg, self.run.step)
 
     def release(self) -> None:
         """Free the device memory of previews."""

@@ -281,9 +281,9 @@ class Handlers:
         preview = PreviewRequest(request.number("page", 0, 1 << 40), view, cast(Pace, pace))
         if not live.requests.wait_for(preview, WAIT):
             raise RequestError(503, "too many preview requests")
-        if preview.picture is None:
+        if preview.image is None:
             return Response(204)
-        return Response(200, preview.picture.jpeg, "image/jpeg", {"X-Step": str(preview.picture.step)})
+        return Response(200, preview.image.jpeg, "image/jpeg", {"X-Step": str(preview.image.step)})
 
     def _picture(self, request: Request, kind: Kind) -> Response:
         run = self._require_scene()
