@@ -135,7 +135,7 @@ class Gltf:
         self.spz_bytes += sum(table.nbytes for table in splats.parameters.values())
         if self.spz_bytes > 4 * max(MAX_RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # as for a single SPZ
             raise DataError(
-                f"{self.path}: its SPZ data decompresses to {self.spz_bytes} bytes, too many; export it again"
+                f"{self.path}: its SPZ data decompresses to {self.spz_bytes} bytes, which is too many; export it again"
             )
         part, axes = splats.parameters, [LEFT_UP_FRONT, FLIP]
         position = self.tree["accessors"][_index(attributes["POSITION"])] if "POSITION" in attributes else {}

@@ -184,7 +184,7 @@ def _check_section(path: Path, section: SplatSection, index: int) -> None:
     if section.degree > MAX_DEGREE or section.count > section.rows:
         raise DataError(
             f"{path}: section {index} has {section.count} splats in {section.rows} rows, SH degree {section.degree}; "
-            f"expected no more splats than rows, and degree 0 to {MAX_DEGREE}; the file is damaged, copy it again"
+            f"expected no more splats than rows, and degree 0 to {MAX_DEGREE}; the file is damaged: copy it again"
         )
     bucket_count = section.full_buckets + section.partial_buckets
     if (section.buckets and section.bucket_bytes < 12) or bucket_count > section.buckets:

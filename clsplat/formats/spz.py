@@ -178,7 +178,7 @@ def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) 
     target_bits = min((FINE_FRACTION if is_fine else FRACTION) + extra_bits, MAX_FRACTION)
     bits = min(target_bits, math.floor(math.log2(MAX_INT24 / max(max_value, 1e-9))))
     if bits < 0:
-        raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model has {max_value:g}; crop it")
+        raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model reaches {max_value:g}; crop it")
     if bits < min(FRACTION + extra_bits, MAX_FRACTION):
         LOG.warning(
             "%s: because of its largest coordinate, %g, SPZ rounds all positions to %.3g instead of %.3g scene units; "

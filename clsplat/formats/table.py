@@ -253,8 +253,8 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
         require_static(path, splats, codec.name)
     if not codec.keeps_all and (count := int(not_finite(splats.parameters).sum())):
         raise DataError(
-            f"{path}: {count:,} Gaussians have values that are not finite, which {codec.name} cannot store; drop them, "
-            "or write a PLY"
+            f"{path}: {count:,} Gaussians have values that are not finite, which {codec.name} cannot store; drop them "
+            "with `clsplat convert`, or write a PLY"
         )
     options = options or Writing()
     if not options.quiet:

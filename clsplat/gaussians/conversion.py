@@ -55,7 +55,7 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
     for model, name in zip(models, names, strict=True):
         filters = [_describe_filter(m) for m in (first, model)]
         if filters[0] != filters[1]:
-            raise DataError(f"{name}: is {filters[1]}, but {names[0]} is {filters[0]}; merge models of one kind")
+            raise DataError(f"{name}: is {filters[1]}, but {names[0]} is {filters[0]}; merge only models of one kind")
         values, first_values = model.rendering.comment(), first.rendering.comment()
         different_keys = [key for key in SHARED if values.get(key) != first_values.get(key)]
         if differences := [f"{key} = {values.get(key, 'not set')}" for key in different_keys]:

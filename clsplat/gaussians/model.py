@@ -180,7 +180,7 @@ class Model:
         Raises ValueError for other times, and DataError if some positions are not finite.
         """
         if not 0 <= time <= 1:
-            raise ValueError(f"time is {time:g}; expected a number from 0 (start) to 1 (end)")
+            raise ValueError(f"the time is {time:g}; expected a number from 0 (start) to 1 (end)")
         if self.motion is None:
             return self
         tables: dict[str, Any] = dict(evaluate_at(self.tables(), time))

@@ -405,7 +405,7 @@ def _read_largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     models = [(folder, read_images(folder)) for folder in find_models(path)]
     if not models:
         raise DataError(
-            f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse, or ."
+            f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse, or that folder"
         )
     best = max(models, key=lambda model: len(model[1]))
     if unused := ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0]):

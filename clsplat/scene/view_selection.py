@@ -244,7 +244,7 @@ class Split:
             if not test:
                 remedy = "lower its offset" if holdout.every else "name photos of the dataset"
                 raise DataError(
-                    f"{scene.path}: scene.holdout selects 0 of {len(names)} photos for testing; expected some: "
+                    f"{scene.path}: scene.holdout selects 0 of {len(names)} photos for testing; "
                     f"{remedy}, or set scene.holdout to 0 for none"
                 )
             scene = _with_test(scene, test)

@@ -149,7 +149,7 @@ def test_faint_opacities_keep_their_digits():
 
 def test_mip_model_is_not_merged_with_a_plain_one(source, tmp_path, rng):
     write(tmp_path / "b.ply", splats(rng, 30, 1, "mip"))
-    with pytest.raises(DataError, match=r"b\.ply: is a mip model, .*a\.ply is a plain model; merge models of one kind"):
+    with pytest.raises(DataError, match=r"b\.ply: is a mip model, .*a\.ply is a plain model; merge only"):
         clsplat.convert([source, tmp_path / "b.ply"], tmp_path / "c.ply")
 
 
