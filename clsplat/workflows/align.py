@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.text_table import text_table
 from clsplat.formats.splats import Writing
-from clsplat.formats.table import format_of_name, model_file
+from clsplat.formats.table import format_from_name, model_file
 from clsplat.gaussians.conversion import check_output, write_model
 from clsplat.gaussians.model import Model, load, model_path
 from clsplat.runs.model_file import ModelSource, find_run, refuse_field
@@ -226,7 +226,7 @@ def align(
 
     Returns the alignment as JSON values, and `files`.  Raises ClsplatError.
     """
-    is_model = format_of_name(out) is not None
+    is_model = format_from_name(out) is not None
     subject = Subject.read(path, scene, is_model)
     if not is_model:
         if subject.scene is None:
