@@ -157,8 +157,8 @@ def invalid_variant_reason(kind: type[Settings]) -> str | None:
     """Return the reason why a class that resembles a variant cannot be used in a pipeline file, or None."""
     if kind.__subclasses__():
         return None
-    if missing := sorted(getattr(kind, "__abstractmethods__", ())):
-        return f"lacks {', '.join(missing)}"
+    if missing_methods := sorted(getattr(kind, "__abstractmethods__", ())):
+        return f"lacks {', '.join(missing_methods)}"
     bases = [base for base in kind.__mro__[1:] if issubclass(base, Settings) and base is not Settings]
     tags = [tag for base in bases for other in variants(base).values() if (tag := variant_tag(other))]
     if not tags:

@@ -109,9 +109,9 @@ class ScreenFilter(Settings):
     @classmethod
     def __pydantic_init_subclass__(cls, **values: Any) -> None:
         super().__pydantic_init_subclass__(**values)
-        unused = [name for name in cls.model_fields if name not in (*ScreenFilter.model_fields, "type")]
-        if unused and cls.parameters is ScreenFilter.parameters:
-            raise ConfigError(f"{cls.__name__}: its key '{unused[0]}' has no effect; override ScreenFilter.parameters")
+        keys = [name for name in cls.model_fields if name not in (*ScreenFilter.model_fields, "type")]
+        if keys and cls.parameters is ScreenFilter.parameters:
+            raise ConfigError(f"{cls.__name__}: its key '{keys[0]}' has no effect; override ScreenFilter.parameters")
 
     def parameters(self) -> tuple[float, float, float]:
         """Return `variance`, `compensate`, and 1 to integrate splats over the pixel's box, otherwise 0."""

@@ -141,10 +141,10 @@ def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
     order = np.argsort(angles, kind="stable")
     gaps = np.degrees(np.diff(np.append(angles[order], angles[order[0]] + 2 * np.pi)))
     inner_gaps = np.where(gaps < OPEN_SIDE, gaps, 0.0)
-    widest = int(np.argmax(inner_gaps))
-    if inner_gaps[widest] < max(MIN_GAP, UNEVEN * float(np.median(gaps))):
+    index = int(np.argmax(inner_gaps))
+    if inner_gaps[index] < max(MIN_GAP, UNEVEN * float(np.median(gaps))):
         return None
-    return float(gaps[widest]), views[order[widest]].name, views[order[(widest + 1) % len(views)]].name
+    return float(gaps[index]), views[order[index]].name, views[order[(index + 1) % len(views)]].name
 
 
 def _cylindrical(

@@ -65,11 +65,11 @@ class PaletteSh(Scheduled):
         gaussians = run.model.gaussians
         if not gaussians.sh_degree:
             return
-        rest, error = gaussians.get("sh_rest"), visible_error(run)
-        improve = partial(error.improve_palette, rest, nearest=partial(find_most_similar, run.device))
-        harmonics = Harmonics.fit(rest, self.quality, error.weights, improve, self.step)
+        sh_rest, error = gaussians.get("sh_rest"), visible_error(run)
+        improve = partial(error.improve_palette, sh_rest, nearest=partial(find_most_similar, run.device))
+        harmonics = Harmonics.fit(sh_rest, self.quality, error.weights, improve, self.step)
         gaussians.set("sh_rest", harmonics.values)
-        gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(rest - harmonics.values))
+        gaussians.set("sh_base", gaussians.get("sh_base") + error.base_change(sh_rest - harmonics.values))
         set_clusters(gaussians, harmonics.labels, error.weights)
         if run.adam is not None:
             run.adam.reset_moments("sh_rest")
@@ -169,17 +169,17 @@ class VisibleError:
         second[i == j] += UNSEEN / (4 * np.pi) * (weights + FAINT * weights.mean())  # |e|^2 / 4 pi over the sphere
         return cls(weights, np.ascontiguousarray(mean.T), second)
 
-    def gradient(self, rest: NDArray[np.floating]) -> Floats:
+    def gradient(self, sh_rest: NDArray[np.floating]) -> Floats:
         """Return the gradient A x of the error at coefficients x of three channels, [N, 3 K]; A is `form`."""
         table, products = (
-            rest.reshape(len(rest), -1, 3).astype(np.float64),
-            np.zeros((len(rest), self.mean.shape[1], 3)),
+            sh_rest.reshape(len(sh_rest), -1, 3).astype(np.float64),
+            np.zeros((len(sh_rest), self.mean.shape[1], 3)),
         )
         for index, (row, column) in enumerate(zip(*np.triu_indices(table.shape[1]), strict=True)):
             products[:, row] += self.form[index, :, None] * table[:, column]
             if row != column:
                 products[:, column] += self.form[index, :, None] * table[:, row]
-        return products.reshape(rest.shape)
+        return products.reshape(sh_rest.shape)
 
     def base_change(self, error: NDArray[np.floating]) -> Floats:
         """Return the change of band 0, [N, 3], that best compensates an error of the other bands, [N, 3 K]."""
@@ -187,14 +187,14 @@ class VisibleError:
         return np.asarray((self.mean[:, :, None] * channels).sum(axis=1) / SH_C0)
 
     def improve_palette(
-        self, rest: NDArray[np.float32], vectors: Floats, *, nearest: Nearest
+        self, sh_rest: NDArray[np.float32], vectors: Floats, *, nearest: Nearest
     ) -> tuple[Floats, NDArray[np.int64]]:
         """Return a palette's vectors, [E, 3 K], improved to less visible errors, and the label of each Gaussian, [N].
 
         This is Lloyd's iteration with the quadratic form of each Gaussian as its distance.  nearest: returns for
         points, [N, c], the index of the vector, [E, c], with the largest dot product.  Unused vectors do not change.
         """
-        products = self.gradient(rest)
+        products = self.gradient(sh_rest)
         points = self._points(products)
         for _ in range(ROUNDS):
             labels = nearest(points, _append_products(vectors))

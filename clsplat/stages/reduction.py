@@ -128,22 +128,22 @@ class ReduceSh(Scheduled):
         model.degree = min(model.degree, self.degree)
         if not self.share or not gaussians.sh_degree:
             return
-        rest = gaussians.get("sh_rest")
-        energy = compute_band_energy(rest) * score_gaussians(run)[:, None]
+        sh_rest = gaussians.get("sh_rest")
+        energy = compute_band_energy(sh_rest) * score_gaussians(run)[:, None]
         is_dropped = ~select_largest(energy.ravel(), energy.size - round(self.share * energy.size))
-        gaussians.set("sh_rest", np.where(expand_bands(is_dropped.reshape(energy.shape)), 0, rest))
+        gaussians.set("sh_rest", np.where(expand_bands(is_dropped.reshape(energy.shape)), 0, sh_rest))
         if run.adam is not None:
             run.adam.reset_moments("sh_rest")
         LOG.info("%d of %d SH bands are zero", is_dropped.sum(), is_dropped.size)
 
 
-def compute_band_energy(rest: NDArray[np.float32]) -> NDArray[np.float64]:
+def compute_band_energy(sh_rest: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the mean square of each band above 0 over the sphere, [N, degree].  Coefficients are [N, (K-1)*3].
 
     The basis is orthonormal: the mean square of a function is the sum of its squared coefficients divided by 4 pi.
     """
-    squares = np.square(rest.astype(np.float64)) / (4 * np.pi)
-    return np.stack([squares[:, first:end].sum(axis=1) for first, end in _bands(rest.shape[1])], axis=1)
+    squares = np.square(sh_rest.astype(np.float64)) / (4 * np.pi)
+    return np.stack([squares[:, first:end].sum(axis=1) for first, end in _bands(sh_rest.shape[1])], axis=1)
 
 
 def expand_bands(bands: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -108,8 +108,8 @@ def check(best: Best | None, tables: Tables) -> None:
         if tables:
             raise DataError("it has the tables of a best model, but no record of one")
         return
-    if missing := [name for name in (*PARAMETERS, "filter_variance") if name not in tables]:
-        raise DataError(f"its best model lacks {', '.join(missing)}")
+    if missing_names := [name for name in (*PARAMETERS, "filter_variance") if name not in tables]:
+        raise DataError(f"its best model lacks {', '.join(missing_names)}")
     count = len(tables["means"])
     for name, table in tables.items():
         widths = WIDTHS.get(name, (1,))

@@ -95,8 +95,8 @@ class State(BaseModel):
 
 def check_tables(state: State, tables: Arrays) -> None:
     """Raise DataError if the tables of Gaussians are incomplete, have wrong shapes, or do not fit the state."""
-    if missing := [name for name in PARAMETERS if name not in tables]:
-        raise DataError(f"lacks {', '.join(missing)}")
+    if missing_names := [name for name in PARAMETERS if name not in tables]:
+        raise DataError(f"lacks {', '.join(missing_names)}")
     count = len(tables["means"])
     for name, table in tables.items():
         if table.dtype != np.float32 or table.ndim != 2 or len(table) != count:
@@ -381,10 +381,10 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
     return None, []
 
 
-def rename_damaged(out: Path, restored: Path | None) -> None:
+def rename_damaged(out: Path, restored_path: Path | None) -> None:
     """Rename damaged checkpoints that are newer than the restored one, so that `save` does not count them."""
     files = list_files(out)
-    for damaged_file in files[files.index(restored) + 1 :] if restored else ():
+    for damaged_file in files[files.index(restored_path) + 1 :] if restored_path else ():
         try:
             damaged_file.rename(damaged_file.with_name(re.sub("^(step|refit)", "damaged", damaged_file.name)))
         except OSError as error:

@@ -71,8 +71,8 @@ def _plan(run: Run, harmonics: Location, visible: float = VISIBLE_FRACTION) -> M
 def _visible_fraction(run: Run) -> float:
     """Return the largest fraction of row blocks visible in one view, over VIEWS training views, with a margin."""
     survey, gaussians = run.survey(), run.model.gaussians
-    lanes, largest = int(run.device.tuning["LANES"]), 0.0
+    lanes, max_fraction = int(run.device.tuning["LANES"]), 0.0
     for view in survey.render(survey.sample_views(VIEWS)):
         keys = view.frame.depth_key.get()[: gaussians.count // lanes * lanes]
-        largest = max(largest, float((keys != NO_SLOT).reshape(-1, lanes).any(axis=1).mean()))
-    return GROWTH * largest
+        max_fraction = max(max_fraction, float((keys != NO_SLOT).reshape(-1, lanes).any(axis=1).mean()))
+    return GROWTH * max_fraction

@@ -217,7 +217,7 @@ class StatusFile:
         Raises OutputError if another run has taken over the folder.
         """
         self.require_lock()
-        outer = {"stage": self.now.stage, "progress": self.now.progress}
+        outer_fields = {"stage": self.now.stage, "progress": self.now.progress}
         start, outer_nested_seconds = time.perf_counter(), self._nested_seconds
         self._nested_seconds = 0.0
         self._depth += 1
@@ -228,7 +228,7 @@ class StatusFile:
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds - self._nested_seconds
         self._nested_seconds = outer_nested_seconds + seconds
         if self._depth:
-            self.note(**outer)
+            self.note(**outer_fields)
 
     def refresh(self) -> None:
         """Write the status of a run in progress; failures are logged once."""
