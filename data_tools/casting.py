@@ -39,9 +39,9 @@ class World:
         distance = np.full(np.broadcast_shapes(origins.shape, directions.shape)[1], np.inf)
         index = np.zeros(distance.shape, np.intp)
         for i, shape in enumerate(self.shapes):
-            hit = shape.intersect(origins, directions)
-            index[hit < distance] = i
-            distance = np.minimum(distance, hit)
+            hits = shape.intersect(origins, directions)
+            index[hits < distance] = i
+            distance = np.minimum(distance, hits)
         return distance, index
 
     def by_shape(self, method: Callable[[Shape, Array], Array], index: NDArray[np.intp], points: Array) -> Array:

@@ -158,7 +158,7 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
             total = sum(size for _, size, _ in members)
             if total > MAX_UNPACKED_SIZE:
                 raise DataError(
-                    f"{archive}: would unpack to {total >> 30} GiB; expected at most {MAX_UNPACKED_SIZE >> 30}"
+                    f"{archive}: would unpack to {total >> 30} GiB; expected at most {MAX_UNPACKED_SIZE >> 30} GiB"
                 )
             report(f"unpacking {len(members)} files, {total / 1e6:,.0f} MB")
             for name, size, open_member in members:
@@ -203,10 +203,10 @@ def _checked_path(archive: Path, name: str) -> PurePosixPath:
 
 def _copy(stream: BinaryIO, file: BinaryIO, size: int, archive: Path) -> None:
     """Copy a file of an archive.  Raises DataError if it is larger than its declared size."""
-    remaining = size
-    while chunk := stream.read(min(CHUNK, remaining + 1)):
-        remaining -= len(chunk)
-        if remaining < 0:
+    remaining_bytes = size
+    while chunk := stream.read(min(CHUNK, remaining_bytes + 1)):
+        remaining_bytes -= len(chunk)
+        if remaining_bytes < 0:
             raise DataError(f"{archive}: a file is larger than declared; download it from another source")
         try:
             file.write(chunk)

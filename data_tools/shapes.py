@@ -69,16 +69,16 @@ def sphere_interval(origins: Array, directions: Array, radius: float) -> tuple[A
     origins, directions: [3, R] for a sphere, [2, R] for a cylinder
     """
     a, b = np.maximum(dot(directions, directions), 1e-12), dot(origins, directions)
-    square = b * b - a * (dot(origins, origins) - radius * radius)
-    root = np.sqrt(np.maximum(square, 0))
-    return np.where(square > 0, (-b - root) / a, np.inf), (root - b) / a
+    discriminant = b * b - a * (dot(origins, origins) - radius * radius)
+    root = np.sqrt(np.maximum(discriminant, 0))
+    return np.where(discriminant > 0, (-b - root) / a, np.inf), (root - b) / a
 
 
 def slab_interval(origins: Array, directions: Array, half: float) -> tuple[Array, Array]:
     """Return the distances (enter, leave) between which one coordinate of rays is within `half` of 0."""
     inverse = 1 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
-    middle, reach = -origins * inverse, half * np.abs(inverse)
-    return middle - reach, middle + reach
+    center, reach = -origins * inverse, half * np.abs(inverse)
+    return center - reach, center + reach
 
 
 def intersect_intervals(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -193,5 +193,5 @@ class Cylinder(Shape):
 
     def local_normal(self, points: Array) -> Array:
         x, y, z = points
-        cap = np.abs(z) - self.half > np.hypot(x, y) - self.radius
-        return np.where(cap, [0 * x, 0 * x, np.sign(z)], [x / self.radius, y / self.radius, 0 * z])
+        is_cap = np.abs(z) - self.half > np.hypot(x, y) - self.radius
+        return np.where(is_cap, [0 * x, 0 * x, np.sign(z)], [x / self.radius, y / self.radius, 0 * z])

@@ -68,10 +68,10 @@ def planks(p: Array) -> Array:
 
 def chessboard(p: Array) -> Array:
     """Paint 8 x 8 squares of veined stone, each 0.115 wide, in a walnut frame."""
-    odd = (np.floor(p[0] / 0.115) + np.floor(p[1] / 0.115)) % 2 > 0
+    is_odd = (np.floor(p[0] / 0.115) + np.floor(p[1] / 0.115)) % 2 > 0
     vein = np.abs(noise(9 * p, 3) - 0.5) * 2
     light, dark = (0.84, 0.79, 0.66), (0.015, 0.10, 0.075)
-    stone = mix(mix((0.30, 0.34, 0.30), dark, vein**0.4), mix((0.42, 0.33, 0.2), light, vein**0.3), odd)
+    stone = mix(mix((0.30, 0.34, 0.30), dark, vein**0.4), mix((0.42, 0.33, 0.2), light, vein**0.3), is_odd)
     edge = np.maximum(np.abs(p[0]), np.abs(p[1]))
     frame = mix((0.16, 0.07, 0.03), (0.06, 0.025, 0.012), grain(p))
     return mix(mix(stone, (0.65, 0.42, 0.1), edge > 0.46), frame, edge > 0.47)

@@ -95,8 +95,8 @@ class Trainer:
         self.pipeline = load(str(pipeline), [*scene_path, *overrides(set or {})])
         _check_pipeline(self.pipeline)
         self.scene = scene if isinstance(scene, Scene) else read_scene(folder, self.pipeline.settings.scene.split)
-        if missing := [view.name for view in self.scene.split("train") if not view.has_photograph]:
-            raise DataError(f"{self.scene.path}: the view '{missing[0]}' has no image; training needs one per view")
+        if names := [view.name for view in self.scene.split("train") if not view.has_photograph]:
+            raise DataError(f"{self.scene.path}: the view '{names[0]}' has no image; training needs one per view")
         if start != "new" and out is None:
             raise ConfigError(f"start='{start}': expected a run folder as `out`")
         if out is None:

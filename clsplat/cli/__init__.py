@@ -19,13 +19,13 @@ DEBUG, PLUGIN = "--debug", "--plugin"  # options that may come before or after t
 OPTIONAL_VALUES = {"--live": ("0", str.isdecimal), "--depth": ("mean", ("mean", "median").__contains__)}  # default
 
 
-def main(*leading: str) -> None:
+def main(*prefix: str) -> None:
     """Run the command line.  An error prints one line, and with --debug also its traceback.
 
-    leading: arguments to insert before those of the process.
+    prefix: arguments to insert before those of the process.
     """
     signals.install()
-    arguments = _move_options_first(_expand_optional(_expand_set([*leading, *sys.argv[1:]])))
+    arguments = _move_options_first(_expand_optional(_expand_set([*prefix, *sys.argv[1:]])))
     try:
         with stopping_on_signals(stop_at_once):
             exit_code = app(arguments, prog_name="clsplat", standalone_mode=False)
@@ -97,10 +97,10 @@ def _move_options_first(arguments: list[str]) -> list[str]:
     """Move `--debug` and `--plugin FILE` before the command."""
     others = [argument for argument in arguments if argument != DEBUG]
     first = [DEBUG] if len(others) < len(arguments) else []
-    remaining: list[str] = []
+    remaining_arguments: list[str] = []
     while others:
         size = 1 if others[0].startswith(f"{PLUGIN}=") else 2 if others[0] == PLUGIN and len(others) > 1 else 0
         first += others[:size]
-        remaining += others[size : size or 1]
+        remaining_arguments += others[size : size or 1]
         del others[: size or 1]
-    return first + remaining
+    return first + remaining_arguments

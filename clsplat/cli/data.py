@@ -28,8 +28,8 @@ def data() -> None:
 def synthetic(
     out: Out,
     size: Annotated[int, typer.Option(min=8, help="Width and height of the images, pixels.")] = 256,
-    train: Annotated[int, typer.Option(min=1, help="Training views.")] = 60,
-    test: Annotated[int, typer.Option(min=1, help="Held-out views.")] = 12,
+    train: Annotated[int, typer.Option(min=1, help="Number of training views.")] = 60,
+    test: Annotated[int, typer.Option(min=1, help="Number of held-out views.")] = 12,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")] = 0,
 ) -> None:
     """Ray-cast the demo scene: a still life with exact cameras, in the Blender (NeRF-synthetic) layout."""

@@ -262,7 +262,7 @@ def compress(
         typer.Option(
             min=1,
             metavar="N",
-            help="Training steps after each pruning; a fifth as many after a palette; default: 1000.",
+            help="Training steps after each pruning, and a fifth of them for each palette; default: 1000.",
         ),
     ] = None,
     device: DeviceOption = None,

@@ -91,9 +91,9 @@ def histogram(title: str, values: Sequence[float], bins: int = 24) -> str:
         parts += _grid_line(HEIGHT - BOTTOM - tick / max(counts) * height, label)
     for i, count in enumerate(counts):
         if count:
-            bar = count / max(counts) * height
-            corner = f'x="{LEFT + i * width / bins + 1:.1f}" y="{HEIGHT - BOTTOM - bar:.1f}"'
-            parts.append(f'<rect {corner} width="{width / bins - 2:.1f}" height="{bar:.1f}" fill="{COLORS[0]}"/>')
+            length = count / max(counts) * height
+            corner = f'x="{LEFT + i * width / bins + 1:.1f}" y="{HEIGHT - BOTTOM - length:.1f}"'
+            parts.append(f'<rect {corner} width="{width / bins - 2:.1f}" height="{length:.1f}" fill="{COLORS[0]}"/>')
     x_ticks = _ticks(0, max_value)
     for tick, label in zip(x_ticks, _tick_labels(x_ticks), strict=True):
         x = LEFT + tick / max_value * width
@@ -214,9 +214,9 @@ def _plan(
     centers = {name: np.stack([view.position for view in group]) @ axes.T for name, group in views.items()}
     positions = np.concatenate([points @ axes.T, *centers.values()])
     low, high = positions.min(axis=0), positions.max(axis=0)
-    available = np.array([PLAN_WIDTH - 2 * MARGIN, PLAN_HEIGHT - TITLE - 2 * MARGIN])
-    scale = float((available / np.maximum(high - low, 1e-12)).min())
-    corner = np.array([MARGIN, MARGIN + TITLE]) + (available - scale * (high - low)) / 2
+    plot_size = np.array([PLAN_WIDTH - 2 * MARGIN, PLAN_HEIGHT - TITLE - 2 * MARGIN])
+    scale = float((plot_size / np.maximum(high - low, 1e-12)).min())
+    corner = np.array([MARGIN, MARGIN + TITLE]) + (plot_size - scale * (high - low)) / 2
 
     def pixels(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(corner + scale * (values - low))

@@ -114,14 +114,14 @@ def _visible_indices(model: Model) -> NDArray[np.intp]:
 
 def _draw_order(model: Model, limit: int | None) -> NDArray[np.intp]:
     """Return the indices of visible Gaussians in LEVELS parts of decreasing importance, each part in Morton order."""
-    visible = _visible_indices(model)
-    means = model.means[visible].astype(np.float64)
-    areas = np.sort(model.log_scales[visible].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
-    by_importance = np.argsort(-(areas + np.log(model.opacities[visible].astype(np.float64))), kind="stable")[:limit]
+    indices = _visible_indices(model)
+    means = model.means[indices].astype(np.float64)
+    areas = np.sort(model.log_scales[indices].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+    by_importance = np.argsort(-(areas + np.log(model.opacities[indices].astype(np.float64))), kind="stable")[:limit]
     points = _logarithmic(means, *_frame(means))
     borders = [len(by_importance) * level // LEVELS for level in range(LEVELS + 1)]
     parts = [by_importance[begin:end] for begin, end in itertools.pairwise(borders)]
-    return np.asarray(visible[np.concatenate([part[morton_order(points[part])] for part in parts])])
+    return np.asarray(indices[np.concatenate([part[morton_order(points[part])] for part in parts])])
 
 
 def _frame(means: Floats) -> tuple[Floats, float]:

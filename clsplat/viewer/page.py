@@ -194,9 +194,9 @@ def view_entries(
         views.append(
             {"name": view.name, "split": split, "thumbnail": thumbnail, "photograph": photograph, **camera_data(view)}
         )
-    with_photo = [view for view in views if view["photograph"]]
-    for i in omitted_indices([len(view["photograph"]) for view in with_photo], round(1e6 * budget)):
-        with_photo[i]["photograph"] = None
+    views_with_photo = [view for view in views if view["photograph"]]
+    for i in omitted_indices([len(view["photograph"]) for view in views_with_photo], round(1e6 * budget)):
+        views_with_photo[i]["photograph"] = None
     return views
 
 

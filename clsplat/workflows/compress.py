@@ -175,10 +175,10 @@ def cells(entry: Entry, source: Entry) -> list[str]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Format the record of a search as text; a star marks the chosen file."""
+    """Format the record of a search as text; a star marks the best file."""
     source, entries = Entry(**result["source"]), [Entry(**entry) for entry in result["points"]]
-    chosen = result["chosen"] and Entry(**result["chosen"])
-    marks = ["", "", *("*" if entry == chosen else "" for entry in entries)]
+    best_entry = result["chosen"] and Entry(**result["chosen"])
+    marks = ["", "", *("*" if entry == best_entry else "" for entry in entries)]
     rows = [HEADINGS, *(cells(entry, source) for entry in (source, *entries))]
     return text_table([[mark, *row] for mark, row in zip(marks, rows, strict=True)])
 
@@ -187,7 +187,7 @@ def page(
     target: CompressionTarget,
     source: Entry,
     entries: Sequence[Entry],
-    chosen: Entry | None,
+    best_entry: Entry | None,
     split: str,
     scene: str,
     model: str,
@@ -199,19 +199,19 @@ def page(
         title=f"{scene} · {source.file}, compressed to {target.text}",
         subtitle=f"{model}; PSNR and SSIM of the {split} views, measured on every file after reading it back",
         result=result,
-        verdict=_verdict(target, source, chosen),
+        verdict=_verdict(target, source, best_entry),
         curves=mark_charts_safe([curve("PSNR, dB, over the file's size, MB", _lines(target, source, entries))]),
         headings=HEADINGS,
-        rows=[(entry.file, cells(entry, source), entry == chosen) for entry in (source, *entries)],
+        rows=[(entry.file, cells(entry, source), entry == best_entry) for entry in (source, *entries)],
     )
 
 
-def _verdict(target: CompressionTarget, source: Entry, chosen: Entry | None) -> str:
-    if chosen is None:
+def _verdict(target: CompressionTarget, source: Entry, best_entry: Entry | None) -> str:
+    if best_entry is None:
         return f"No file has met the target {target.text} so far."
     return (
-        f"{chosen.file}: {chosen.bytes / 1e6:.3g} MB, {chosen.bytes / source.bytes:.1%} of the model, "
-        f"{chosen.psnr:.2f} dB, {chosen.psnr - source.psnr:+z.2f} dB"
+        f"{best_entry.file}: {best_entry.bytes / 1e6:.3g} MB, {best_entry.bytes / source.bytes:.1%} of the model, "
+        f"{best_entry.psnr:.2f} dB, {best_entry.psnr - source.psnr:+z.2f} dB"
     )
 
 
@@ -252,25 +252,25 @@ class Search:
     entries: list[Entry] = field(default_factory=list)
 
     @property
-    def chosen(self) -> Entry | None:
+    def best_entry(self) -> Entry | None:
         return self.target.best(self.entries, self.source.psnr)
 
     def data(self) -> dict[str, Any]:
         """Return the record of the search as a dictionary for JSON."""
-        chosen = self.chosen
+        best_entry = self.best_entry
         return {
             **self.identity,
             "target": self.target.text,
             "split": self.split,
             "source": asdict(self.source),
             "points": [asdict(entry) for entry in self.entries],
-            "chosen": chosen and asdict(chosen),
+            "chosen": best_entry and asdict(best_entry),
         }
 
     def write(self, result: str = "") -> None:
         """Write the measurements as JSON, and as an HTML page that links to the result."""
         write_text(self.out / RECORD, json.dumps(self.data(), indent=1) + "\n")
-        page_arguments = self.target, self.source, self.entries, self.chosen, self.split
+        page_arguments = self.target, self.source, self.entries, self.best_entry, self.split
         write_text(self.out / PAGE, page(*page_arguments, self.scene, self.identity["model"], result))
 
 
@@ -347,17 +347,17 @@ def _sh_settings(file_format: Format, degree: int) -> Iterable[tuple[int, Qualit
 
 
 def _write_result(search: Search, file_format: Format) -> dict[str, Any]:
-    """Copy the chosen file to the result path; return the record.  Raises ConfigError if no file meets the target."""
-    chosen, psnr = search.chosen, search.source.psnr
+    """Copy the best file to the result path; return the record.  Raises ConfigError if no file meets the target."""
+    best_entry, psnr = search.best_entry, search.source.psnr
     file = _result_path(search.out, file_format)
-    if chosen is None:
-        nearest = search.target.nearest(search.entries)
+    if best_entry is None:
+        nearest_entry = search.target.nearest(search.entries)
         raise ConfigError(
-            f"--target {search.target.text}: no file meets it; the closest, {search.out / nearest.file}, has "
-            f"{nearest.bytes / 1e6:.3g} MB and {nearest.psnr - psnr:+z.2f} dB; {search.target.remedy}"
+            f"--target {search.target.text}: no file meets it; the closest, {search.out / nearest_entry.file}, has "
+            f"{nearest_entry.bytes / 1e6:.3g} MB and {nearest_entry.psnr - psnr:+z.2f} dB; {search.target.remedy}"
             + (f"; the existing {file.name} is for another target" if file.exists() else "")
         )
-    _copy(search.out / chosen.file, file)
+    _copy(search.out / best_entry.file, file)
     search.write(file.name)
     return {**search.data(), "file": str(file), "page": str(search.out / PAGE)}
 

@@ -126,9 +126,9 @@ def require_steps(steps: int) -> None:
 
 def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
     """Return the stages with these names, in order.  Their start steps count from the first of these stages."""
-    selection, remaining, earlier_steps = [], iter(stages), 0
+    selection, stage_iterator, earlier_steps = [], iter(stages), 0
     for name in names:
-        while not _has_name(stage := next(remaining), name):
+        while not _has_name(stage := next(stage_iterator), name):
             earlier_steps += stage[TRAINING]["steps"] if _has_name(stage, TRAINING) else 0
         selection.append(_shift_start(stage, earlier_steps) if _has_name(stage, TRAINING) else stage)
     return selection

@@ -115,8 +115,8 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
     if not 0 < keep <= 1:
         raise ConfigError(f"--keep {keep:g}: expected a fraction of the Gaussians above 0, up to 1")
     baked_model = model.baked()
-    if invalid := int(not_finite(baked_model.tables()).sum()):
-        raise DataError(f"{invalid} Gaussians have values that are not finite; drop them with `clsplat convert`")
+    if invalid_count := int(not_finite(baked_model.tables()).sum()):
+        raise DataError(f"{invalid_count} Gaussians have values that are not finite; drop them with `clsplat convert`")
     target = min(len(baked_model), max(1, int(keep * len(baked_model) + 0.5)))
     if target == len(baked_model):
         return baked_model
@@ -170,8 +170,8 @@ def _neighbors(means: Floats) -> tuple[Rows, Rows]:
     """
     positions, first_row, position_index = np.unique(means, axis=0, return_index=True, return_inverse=True)
     count = len(positions)
-    nearest = cKDTree(positions).query(positions, k=min(NEIGHBORS + 1, count))[1].reshape(count, -1)
-    row, neighbor = first_row[np.repeat(np.arange(count), nearest.shape[1])], first_row[nearest.ravel()]
+    nearest_indices = cKDTree(positions).query(positions, k=min(NEIGHBORS + 1, count))[1].reshape(count, -1)
+    row, neighbor = first_row[np.repeat(np.arange(count), nearest_indices.shape[1])], first_row[nearest_indices.ravel()]
     order = np.argsort(position_index.ravel(), kind="stable")
     is_same = np.diff(position_index.ravel()[order]) == 0
     row = np.concatenate([row, order[:-1][is_same]])

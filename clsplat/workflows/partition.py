@@ -258,7 +258,7 @@ class Partitioner:
         pairs = count_pairs(self._render(self.views), gaussian_count, int(self.device.tuning["TILE"]))
         partition_cells = cells(means, pairs, count)
         cell_index = assign_cells(means, partition_cells)
-        members, start_masks = self._members(cell_index, partition_cells, min_coverage)
+        membership, start_masks = self._members(cell_index, partition_cells, min_coverage)
         blocks = [
             Block(
                 number,
@@ -266,8 +266,8 @@ class Partitioner:
                 int((cell_index == number).sum()),
                 float(pairs[cell_index == number].sum() / (pairs.sum() or 1)),
                 start := start_masks[number] | (cell_index == number),
-                self._view_entries(members, number),
-                self._memory(int(start.sum()), np.flatnonzero(members.assignment[:, number]).tolist()),
+                self._view_entries(membership, number),
+                self._memory(int(start.sum()), np.flatnonzero(membership.assignment[:, number]).tolist()),
                 self.model.origin,
             )
             for number, cell in enumerate(partition_cells)
@@ -283,28 +283,28 @@ class Partitioner:
         is_inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in partition], axis=1)
         coverage, visible_in_block = np.zeros(is_inside.shape), np.zeros((len(partition), len(cell_index)), bool)
         for view, render in enumerate(self._render(self.views)):
-            coverage[view], visible = view_coverage(render, cell_index, len(partition))
-            visible_in_block[Membership(coverage[[view]], is_inside[[view]], min_coverage).view_blocks[0]] |= visible
-        members = Membership(coverage, is_inside, min_coverage)
-        for view, block in np.argwhere(members.assignment & ~members.view_blocks):
+            coverage[view], is_visible = view_coverage(render, cell_index, len(partition))
+            visible_in_block[Membership(coverage[[view]], is_inside[[view]], min_coverage).view_blocks[0]] |= is_visible
+        membership = Membership(coverage, is_inside, min_coverage)
+        for view, block in np.argwhere(membership.assignment & ~membership.view_blocks):
             (render,) = self._render([self.views[view]])
             visible_in_block[block] |= view_coverage(render, cell_index, len(partition))[1]
         # Gaussians hidden from all views may become visible in any
-        return members, visible_in_block | ~visible_in_block.any(axis=0)
+        return membership, visible_in_block | ~visible_in_block.any(axis=0)
 
     def _render(self, views: Sequence[View]) -> Iterator[RenderedView]:
         photographs = (self.photographs.get(view) for view in views)
         return RenderedView.render_all(self._rasterizer, self._uploaded, photographs, self.photographs.background)
 
-    def _view_entries(self, members: Membership, block: int) -> list[dict[str, Any]]:
+    def _view_entries(self, membership: Membership, block: int) -> list[dict[str, Any]]:
         """Return the manifest entries of a block's views, in scene order."""
         return [
             {
                 "name": self.views[view].name,
-                "why": members.reason(view, block),
-                "share": round(float(members.coverage[view, block]), 4),
+                "why": membership.reason(view, block),
+                "share": round(float(membership.coverage[view, block]), 4),
             }
-            for view in np.flatnonzero(members.assignment[:, block]).tolist()
+            for view in np.flatnonzero(membership.assignment[:, block]).tolist()
         ]
 
     def _memory(self, gaussians: int, views: Sequence[int]) -> int:

@@ -43,9 +43,9 @@ class Rig:
         if not views:
             raise DataError("a camera path needs the cameras of a scene, but it has none; use another scene")
         is_outlier = outlier_cameras(views)
-        finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-        stride = -(-len(finite) // MAX_POINTS) or 1
-        return cls([view for view, is_far in zip(views, is_outlier, strict=True) if not is_far], finite[::stride])
+        points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        stride = -(-len(points) // MAX_POINTS) or 1
+        return cls([view for view, is_far in zip(views, is_outlier, strict=True) if not is_far], points[::stride])
 
     @cached_property
     def positions(self) -> Floats:
@@ -412,8 +412,8 @@ def _widest_gap(angles: Floats) -> tuple[float, float]:
     """Return the widest angle without a camera, and the angle of the camera after it, in radians."""
     ring = np.sort(angles % (2 * np.pi))
     gaps = np.diff(np.append(ring, ring[0] + 2 * np.pi))
-    widest = int(gaps.argmax())
-    return float(gaps[widest]), float(ring[(widest + 1) % len(ring)])
+    index = int(gaps.argmax())
+    return float(gaps[index]), float(ring[(index + 1) % len(ring)])
 
 
 def _look_at(rig: Rig, positions: Floats, target: Floats, size: Size) -> list[View]:
