@@ -50,7 +50,7 @@ def doctor(device: "str | Device | None" = None, page: PathLike | None = None) -
 
 
 def inspect_scene(scene: PathLike, page: PathLike | None = None) -> "Inspection":
-    """Inspect a dataset.  Return an inspection with `verdict`, `findings`, `trainable`, and `data()`.
+    """Inspect a dataset.  Return an inspection with `verdict`, `findings`, `is_trainable`, and `data()`.
 
     scene: a dataset folder, or a run folder, whose dataset is inspected
     page: an HTML page to write, which shows the cameras and points in 3D

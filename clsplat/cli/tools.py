@@ -105,7 +105,7 @@ def inspect(
     else:
         show(inspection, terminal.CONSOLE)
         signals.check_output()
-    if not inspection.trainable and not inspection.next_step:
+    if not inspection.is_trainable and not inspection.next_step:
         raise DataError(inspection.verdict)
 
 

@@ -50,7 +50,7 @@ class RenderedView:
 
     def counted_pixels(self) -> NDArray[np.bool_]:
         """Return the mask of the pixels that count, [height, width]."""
-        camera, mask = self.photograph.camera, self.photograph.counted_pixels()
+        camera, mask = self.photograph.camera, self.photograph.unmasked_pixels()
         return np.ones((camera.height, camera.width), bool) if mask is None else mask
 
     def error(self) -> Floats:

@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import NonNegative, at_step
 from clsplat.losses.base import Comparison, ImageLoss, Loss, LossValue
 from clsplat.opencl.device import Array, constants
-from clsplat.photos.appearance import ByNumber, adam_step
+from clsplat.photos.appearance import adam_step
 from clsplat.photos.photographs import apply_mask
 from clsplat.photos.transforms import Planes
 from clsplat.training.modules.base import ModuleState, Scalars, TrainingModule, TrainingStep
@@ -56,7 +56,7 @@ class Haar(TrainingModule):
                     "or dssim, or set `symmetric = True` in the class if the loss is symmetric"
                 )
 
-    def penalty(self, scalars: Scalars, step: int) -> tuple[float, ByNumber]:
+    def penalty(self, scalars: Scalars, step: int) -> tuple[float, Scalars]:
         """Return the loss that pulls the filter toward the Haar filter, and its derivatives."""
         weight = at_step(self.weight, step)
         offsets = {name: value - (name == "haar/scale") for name, value in scalars.items()}
@@ -74,7 +74,7 @@ class HaarState(ModuleState):
         self.settings = settings
 
     @property
-    def filter(self) -> ByNumber:
+    def filter(self) -> Scalars:
         """The learned parameters by name."""
         return {name: self.scalars.get(name, 0.0) for name in NAMES[self.settings.learn]}
 
@@ -98,12 +98,12 @@ class HaarState(ModuleState):
         gradients = wait_for_gradients()
         self.learn({name: gradients[name] + value for name, value in penalty_gradients.items()}, step.number)
 
-    def learn(self, gradients: ByNumber, step: int) -> None:
+    def learn(self, gradients: Scalars, step: int) -> None:
         """Update the filter with Adam."""
         adam_step(self.scalars, self.filter, gradients, at_step(self.settings.rate, step))
 
 
-def apply_filter(planes: Planes, scalars: ByNumber) -> Planes:
+def apply_filter(planes: Planes, scalars: Scalars) -> Planes:
     """Return the planes with the filtered photo; the colors of `planes` do not change."""
     camera, workspace = planes.camera, planes.workspace
     filtered_colors = workspace.array("haar", planes.colors.shape)
@@ -116,7 +116,7 @@ def apply_filter(planes: Planes, scalars: ByNumber) -> Planes:
     return replace(planes, colors=filtered_colors)
 
 
-def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Callable[[], ByNumber]:
+def filter_gradients(planes: Planes, scalars: Scalars, gradient: Array) -> Callable[[], Scalars]:
     """Start computing the gradient of the filter's parameters; return a function that waits for it.
 
     planes: the arguments of `apply_filter`.  gradient: with respect to the filtered colors, [3, rows, stride], zero
@@ -133,14 +133,14 @@ def filter_gradients(planes: Planes, scalars: ByNumber, gradient: Array) -> Call
     )
     group_sums = sums.get_later()
 
-    def derivatives() -> ByNumber:
+    def derivatives() -> Scalars:
         grad_u, grad_v = (float(part.sum(dtype=np.float64)) for part in group_sums())
         return dict(zip(NAMES["filter"], (grad_u - grad_v, grad_u + grad_v), strict=True))
 
     return derivatives
 
 
-def _arguments(planes: Planes, scalars: ByNumber, placeholder: Array) -> dict[str, Any]:
+def _arguments(planes: Planes, scalars: Scalars, placeholder: Array) -> dict[str, Any]:
     """Return the arguments of both kernels.  placeholder: any array, passed if there is no mask."""
     scale, leak = scalars["haar/scale"], scalars.get("haar/leak", 0.0)
     is_masked, sizes = int(planes.mask is not None), planes.camera.plane_arguments()

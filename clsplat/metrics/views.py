@@ -343,14 +343,14 @@ def measure(
     results, flicker_meter, empty_names = list[ViewMetrics](), FlickerMeter(views), list[str]()
     for view in views if progress is None else progress:
         photograph = photographs.get(view)
-        if photograph.empty:
+        if photograph.is_empty:
             LOG.warning("%s: not evaluated, since its mask excludes every pixel; check the mask", view.name)
             continue
         floats = render_floats(painter, photograph.camera, view.response)
         if check_finite:
             require_finite(floats, view)
         render = to_8_bits(floats)
-        image, mask = photograph.image(), photograph.counted_pixels()
+        image, mask = photograph.image(), photograph.unmasked_pixels()
         color = color_metrics(floats, image, mask, colors) if colors else {}
         static_psnr = flicker_meter.add(view, render, image, mask)
         if mask is None:

@@ -22,10 +22,10 @@ MEANING = "a color c of the model (red, green, blue) is min(1, E c + b) in the p
 # Adam for scalars in a dictionary that also contains their moments and is saved in checkpoints.
 
 ADAM = constants("adam.h")
-ByNumber = dict[str, float]
+Scalars = dict[str, float]
 
 
-def adam_step(scalars: dict[str, float], values: Mapping[str, float], gradients: ByNumber, rate: float) -> None:
+def adam_step(scalars: Scalars, values: Mapping[str, float], gradients: Scalars, rate: float) -> None:
     """Update scalars with Adam (Kingma and Ba 2015), with the same constants as for the Gaussians.
 
     values: the current values by name.  `scalars` also contains NAME/updates, NAME/moment1, and NAME/moment2.
@@ -81,7 +81,7 @@ class ViewTable:
             self.center(scalars)
 
     def center(self, scalars: dict[str, float]) -> None:
-        """Subtract from each column its mean over the views, whose exact sum does not depend on their order."""
+        """Subtract from each column its mean over the views.  The sum is exact, so it is independent of their order."""
         for column in zip(*map(self.keys, self.views), strict=True):
             mean = math.fsum(scalars[key] for key in column) / len(column)
             for key in column:

@@ -50,7 +50,7 @@ class DepthMaps:
         files = FileLookup(self.folder, self.folder, new_names, _png_names, strict=True)
         for name, file in zip(new_names, files.paths, strict=True):
             if not file.is_file():
-                raise DataError(f"{file}: the depth map of {name} is missing; add it, or set another folder with --set")
+                raise DataError(f"{file}: the depth map of {name} is missing; add it, or change the folder of the loss")
         self._files.update(zip(new_names, files.paths, strict=True))
 
     def read(self, name: str, width: int, height: int) -> Floats:
@@ -86,7 +86,7 @@ class DepthMaps:
 
 
 def fit_scale_and_offset(values: Floats, inverse: Floats) -> tuple[float, float] | None:
-    """Return the scale and the offset that convert values of a depth map to inverse depths, or None if none fit.
+    """Return the scale and the offset that convert values of a depth map to inverse depths, or None if the fit is poor.
 
     values, inverse: [K].  The fit minimizes absolute differences by iteratively reweighted least squares.
     """

@@ -54,13 +54,13 @@ class Spectrum:
         return float(np.interp(1 / divisor, np.linspace(0, 1, LEVELS + 1), self.cumulative))
 
 
-def knots(spectra: Sequence[Spectrum], until: float, largest: float) -> tuple[Floats, Floats]:
-    """Return the steps and the downscale factors of a schedule, which fall from at most `largest` to 1 at `until`.
+def knots(spectra: Sequence[Spectrum], until: float, max_divisor: float) -> tuple[Floats, Floats]:
+    """Return the steps and the downscale factors of a schedule, which fall from at most `max_divisor` to 1 at `until`.
 
     Equal increments of the summed spectral amplitudes take fewer and fewer steps.  If there is no detail to gain, the
     factor is always 1.
     """
-    first_divisor = min(largest, *(spectrum.divisor(MIN_FRACTION * spectrum.total) for spectrum in spectra))
+    first_divisor = min(max_divisor, *(spectrum.divisor(MIN_FRACTION * spectrum.total) for spectrum in spectra))
     mean = Spectrum(np.mean([spectrum.cumulative for spectrum in spectra], axis=0))
     lowest = mean.amplitude(first_divisor) if first_divisor > 1 else mean.total
     if not 0 < lowest < (1 - NO_DETAIL) * mean.total:
@@ -116,9 +116,9 @@ def describe_sizes(sizes: Points) -> str:
     """Return a sentence about the sizes of the photographs during training.  sizes: the downscale factor by step."""
     (_, first_divisor), *changes = sizes.points
     if not changes and first_divisor == 1:
-        return "photos are trained on at full size, since smaller ones would lose too much detail"
+        return "training uses photos at full size, since smaller ones would lose too much detail"
     clauses = [f"{_describe_size(divisor)} from step {step:.0f}" for step, divisor in changes]
-    return f"photos are trained on at {', '.join([f'{_describe_size(first_divisor)} of their size', *clauses])}"
+    return f"training uses photos at {', '.join([f'{_describe_size(first_divisor)} of their size', *clauses])}"
 
 
 def _describe_size(divisor: float) -> str:

@@ -45,14 +45,14 @@ class Exposures:
         return float(np.std([LUMINANCE @ gains for gains in self.log_gains.values()])) if self.log_gains else 0.0
 
     @property
-    def text(self) -> str:
+    def summary(self) -> str:
         """A summary for messages."""
         if not self.log_gains:
             return self.source
         return f"exposures of {len(self.log_gains)} photos differ by {self.spread:.1%} {self.source}"
 
 
-UNKNOWN = Exposures({}, "neither tracks nor EXIF give exposures")
+UNKNOWN = Exposures({}, "neither tracks nor EXIF gives exposures")
 
 
 def exif_exposures(views: Sequence[View]) -> Exposures:
@@ -65,7 +65,7 @@ def exif_exposures(views: Sequence[View]) -> Exposures:
         return UNKNOWN
     mean = math.fsum(values.values()) / len(values)
     gains = {name: np.full(3, math.log(2) * (value - mean) / GAMMA) for name, value in values.items()}
-    return Exposures(gains, "by EXIF")
+    return Exposures(gains, "according to EXIF")
 
 
 def complete_exposures(base: Exposures, exif: Exposures) -> Exposures:
@@ -110,7 +110,7 @@ def measure_exposures(tracks: Tracks, views: Iterable[View], read: PhotographRea
     is_known = np.isfinite(log_gains).all(axis=1)
     log_gains -= log_gains[is_known].mean(axis=0) if is_known.any() else 0
     fraction = float(1 - residuals[0] / residuals[1]) if residuals[1] > 0 else 0.0
-    source = f"at {shared_count:,} points, which explains {fraction:.0%} of the variance between photos of a point"
+    source = f"at {shared_count:,} points and explain {fraction:.0%} of the color differences at these points"
     return Exposures({name: log_gains[i] for i, name in enumerate(by_name) if is_known[i]}, source, fraction)
 
 

@@ -20,7 +20,7 @@ from clsplat.scene.view import BLACK, WHITE, View, load_transparency
 
 Mask = NDArray[np.bool_]
 BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"black": BLACK, "white": WHITE}
-BUDGET_SHARE = 0.25  # of the device's memory, when no budget is given
+BUDGET_FRACTION = 0.25  # of the device's memory, when no budget is given
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Photograph:
     camera: DeviceCamera
     colors: Array  # [3, height, width] uint8
     mask: Array | None = None  # [1, height, width] uint8, 1 in pixels that count; None if all pixels count
-    empty: bool = False  # whether the mask excludes every pixel
+    is_empty: bool = False  # whether the mask excludes every pixel
     transparency: Array | None = None  # [1, height, width] uint8, 255 for only background; None if opaque or not loaded
 
     @property
@@ -41,7 +41,7 @@ class Photograph:
         """Return the colors on the host, [height, width, 3]."""
         return np.asarray(self.colors.get().transpose(1, 2, 0))
 
-    def counted_pixels(self) -> Mask | None:
+    def unmasked_pixels(self) -> Mask | None:
         """Return an array, [height, width], that is true in unmasked pixels; None if there is no mask."""
         return np.asarray(self.mask.get()[0] > 0) if self.mask else None
 
@@ -95,18 +95,18 @@ class Photographs:
         self.undistorted = undistorted  # folder in which undistorted photographs are cached
         self.background_name = background
         self.background = device.upload(np.array(BACKGROUNDS[background], np.float32))  # [3]
-        self.budget = int(device.info.memory * BUDGET_SHARE) if budget is None else budget
+        self.budget = int(device.info.memory * BUDGET_FRACTION) if budget is None else budget
         self._cache: dict[Key, Photograph] = {}  # least recently used first
-        self._reading: dict[Key, Future[Pixels]] = {}
-        self._reader: ThreadPoolExecutor | None = None
+        self._futures: dict[Key, Future[Pixels]] = {}
+        self._executor: ThreadPoolExecutor | None = None
         self._transparency = False
 
-    def keep_transparency(self) -> None:
+    def enable_transparency(self) -> None:
         """Also load the transparency of photographs, which random backgrounds need."""
         if not self._transparency:
             self._transparency = True
             self._cache.clear()
-            self._reading.clear()
+            self._futures.clear()
 
     def empty_copy(self) -> "Photographs":
         """Return an empty cache with the same background, for views that are used only once."""
@@ -125,7 +125,7 @@ class Photographs:
         key = _key(view)
         photograph = self._cache.pop(key, None)
         if photograph is None:
-            future = self._reading.pop(key, None)
+            future = self._futures.pop(key, None)
             colors, mask, alpha = future.result() if future else self._read(view)
             self._make_room(colors.nbytes + mask.nbytes + (0 if alpha is None else alpha.nbytes))
             device_mask, is_empty = (self.device.upload(mask), not mask.any()) if len(mask) else (None, False)
@@ -136,28 +136,28 @@ class Photographs:
         self._cache[key] = photograph
         return photograph
 
-    def get_usable(self, view: View, original: View, number: int | None = None) -> Photograph:
+    def get_unmasked(self, view: View, original: View, index: int | None = None) -> Photograph:
         """Return the photograph of a view, or of the larger view `original` if the mask excludes all pixels of `view`.
 
-        number: the index of the view, see DeviceCamera.  Raises DataError if the mask excludes all of `original` too.
+        index: the index of the view, see DeviceCamera.  Raises DataError if the mask excludes all of `original` too.
         """
         photograph = self.get(view)
-        if photograph.empty and view is not original:
+        if photograph.is_empty and view is not original:
             photograph = self.get(original)
-        if photograph.empty:
+        if photograph.is_empty:
             raise DataError(
                 f"{original.mask_path or original.image_path}: the mask excludes every pixel of '{original.name}'; "
                 "fix the mask, or remove the photo from the dataset"
             )
-        return replace(photograph, camera=replace(photograph.camera, view=number))
+        return replace(photograph, camera=replace(photograph.camera, view=index))
 
     def prefetch(self, views: Iterable[View]) -> None:
         """Start to read the photographs of views that will be used next."""
         for view in views:
             key = _key(view)
-            if key not in self._cache and key not in self._reading:
-                self._reader = self._reader or ThreadPoolExecutor(1, "photographs")
-                self._reading[key] = self._reader.submit(self._read, view)
+            if key not in self._cache and key not in self._futures:
+                self._executor = self._executor or ThreadPoolExecutor(1, "photographs")
+                self._futures[key] = self._executor.submit(self._read, view)
 
     def _read(self, view: View) -> Pixels:
         image = load_photograph(view, BACKGROUNDS[self.background_name], self.undistorted)

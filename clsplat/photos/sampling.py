@@ -36,8 +36,8 @@ class ViewPool:
         epoch, index = divmod(step - 1, len(entries))
         return self.views[entries[int(self._shuffle(epoch, len(entries))[index])]]
 
-    def random(self, step: int) -> np.random.Generator:
-        """Return a generator that depends only on the seed and the step."""
+    def rng(self, step: int) -> np.random.Generator:
+        """Return a random number generator that depends only on the seed and the step."""
         return np.random.default_rng([self.seed, step, len(self.views)])
 
     def _shuffle(self, epoch: int, count: int) -> NDArray[Any]:
@@ -81,7 +81,7 @@ class StackOrder(Order):
     type: Literal["stack"] = "stack"
 
     def view_at(self, pool: ViewPool, step: int) -> View:
-        rng = pool.random(step)
+        rng = pool.rng(step)
         if rng.random() < FINEST_FRACTION:
             return pool.views[pool.finest[int(rng.integers(len(pool.finest)))]]
         return pool.shuffled_view(range(len(pool.views)), step)
@@ -131,7 +131,7 @@ class ViewSettings(Settings):
         """The latest global step at which the size may change; 0 if it never changes."""
         return self.resolution.until if isinstance(self.resolution, DetailDivisor) else max([0.0, *self.changes])
 
-    def full_size(self, last: int) -> int:
+    def first_large_step(self, last: int) -> int:
         """Return the first step with photographs larger than half their full size, or `last` if there is none."""
         return next((step for step in range(1, last + 1) if self.divisor(step) < 2), last)
 
@@ -142,7 +142,7 @@ class Sample:
 
     view: View  # at the size of the step
     original: View  # at full training size
-    number: int  # index of the view among the training views
+    index: int  # of the view among the training views
     transforms: Sequence[PhotographTransform]
     step: int  # global
 

@@ -48,7 +48,7 @@ class SkyEvidence:
         return float(self.mask[rows].sum() / max(self.unmasked[rows].sum(), MIN_UNMASKED * self.unmasked[rows].size))
 
     @property
-    def upper(self) -> Image:
+    def upper_pixels(self) -> Image:
         """The unmasked pixels of the upper third, [K, 3]."""
         rows = slice(max(1, len(self.image) // 3))
         return np.asarray(self.image[rows][self.unmasked[rows]])
@@ -71,12 +71,12 @@ def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -
     """
     up = up_direction(scene.split("train"))
     for view, image, unmasked in views:
-        reduced = _reduce(image)
-        usable = (
-            np.ones(reduced.shape[:2], bool) if unmasked is None else _reduce(255 * unmasked.astype(np.uint8)) == 255
+        small = _reduce(image)
+        small_mask = (
+            np.ones(small.shape[:2], bool) if unmasked is None else _reduce(255 * unmasked.astype(np.uint8)) == 255
         )
-        mask = sky_mask(reduced, _visible_points(scene, view) * (reduced.shape[1] / view.camera.width), usable)
-        yield SkyEvidence(view, reduced, mask, usable, up)
+        mask = sky_mask(small, _visible_points(scene, view) * (small.shape[1] / view.camera.width), small_mask)
+        yield SkyEvidence(view, small, mask, small_mask, up)
 
 
 def panorama(photos: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32], Mask] | None:

@@ -220,7 +220,7 @@ def _find_fault(folder: Path) -> str:
 
 
 def _reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """Return the reason to run a step: a damaged result, or its difference from the newest result.  "" if it exists."""
+    """Return why a step must run: its result is damaged, or differs from the newest one.  "" if the result is valid."""
     if folder.exists():
         fault = _find_fault(folder)
         return fault and f"{fault}; the result is recomputed"
@@ -242,11 +242,11 @@ def _digest(data: Any) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
-INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that are not figures of the step
+INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that are not statistics of the step
 
 
-def step_facts(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
-    """Return the figures of each step, by the name of the step, without steps whose results were removed."""
+def read_statistics(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
+    """Return the statistics of each step, by the name of the step, without steps whose results were removed."""
     records = {planned_step.step.stage: read_record(planned_step.folder) for planned_step in planned}
     return {
         stage: {key: value for key, value in record.items() if key not in INTERNAL}

@@ -23,8 +23,8 @@ with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as connection:
 def require_pycolmap() -> ModuleType:
     """Import and return pycolmap.  Raises ConfigError when it is not installed.
 
-    The import installs a SIGTERM handler that dumps and exits, and reports any exception as a broken install.
-    Signals are therefore deferred until the import has finished, and their handlers are restored.
+    The import installs a SIGTERM handler that prints a stack trace and exits, and reports any exception as a broken
+    install.  Signals are therefore deferred until the import has finished, and their handlers are restored.
     """
     signals: list[None] = []
     try:

@@ -18,7 +18,7 @@ from clsplat.scene.quality import is_blurred, measure_sharpness
 FEW_FEATURES = 300  # per photograph: a plain wall has tens, a garden thousands
 MIN_TEXTURED = 1000  # features of a photograph with enough texture
 FEW_MATCHES = 30  # matches with the points of a model; COLMAP does not place a photograph that has fewer
-MAX_COMPARED = 15  # number of placed photographs whose median sharpness is the typical one
+MAX_COMPARED = 15  # number of placed photographs from which the typical sharpness is computed
 
 
 @dataclass
@@ -96,10 +96,10 @@ def _describe_groups(graph: MatchGraph, groups: Sequence[list[str]]) -> str:
     single_names = [name for group in groups if len(group) == 1 for name in group]
     count = len(groups) - len(single_names)
     if not count:
-        return f"no two of them overlap enough: {max(graph.pairs.values())} matches at most"
+        return f"no two of them overlap enough: at most {max(graph.pairs.values())} features match"
     suffix = f", and {len(single_names)} without a good match ({first_few(single_names)})" if single_names else ""
-    largest = f"{len(groups[0])} ({first_few(groups[0])})"
-    return f"they do not connect: {pluralize(count, 'group')} with good matches, the largest of {largest}{suffix}"
+    first_group = f"{len(groups[0])} ({first_few(groups[0])})"
+    return f"they do not connect: {pluralize(count, 'group')} with good matches, the largest with {first_group}{suffix}"
 
 
 def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str, str]:
@@ -126,8 +126,8 @@ def _reason(graph: MatchGraph, name: str, placed_names: set[str], typical_sharpn
     counts = {other: count for other, count in matches.items() if other in placed_names}
     if graph.features[name] < FEW_FEATURES:
         return f"only {pluralize(graph.features[name], 'feature')}: blurred, dark, or a plain surface"
-    is_unsharp = is_blurred(graph.measure_sharpness(name), typical_sharpness)
-    note = "; it may be blurred" if is_unsharp else ""
+    is_blurry = is_blurred(graph.measure_sharpness(name), typical_sharpness)
+    note = "; it may be blurred" if is_blurry else ""
     if not matches:  # only a guess: a photograph without fine detail measures like a blurred one
         return f"matches no other photo{note}"
     best = max(matches, key=lambda other: (matches[other], other))
@@ -135,4 +135,4 @@ def _reason(graph: MatchGraph, name: str, placed_names: set[str], typical_sharpn
         return f"matches only {best}, which is not placed either"
     if max(counts.values()) < FEW_MATCHES:
         return f"few matches, at most {max(counts.values())}, with {max(counts, key=lambda o: (counts[o], o))}{note}"
-    return "blurred" if is_unsharp else f"{matches[best]} matches with {best}, but too few on points of the model"
+    return "blurred" if is_blurry else f"{matches[best]} matches with {best}, but too few on points of the model"

@@ -58,10 +58,10 @@ def find_features(
 ) -> dict[str, Any]:
     """Find the features of the photographs in a folder, and write a COLMAP database in the folder `out`.
 
-    Returns the numbers of photographs and cameras, and the photographs that cannot be read, by name, with the reason.
-    Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`, photographs of the
-    same size share a camera if EXIF has the same lens for them, or none.  Raises DataError when fewer than three
-    photographs can be read.
+    Returns the number of photographs, the number of cameras, and a dict from the names of unreadable photographs to the
+    reasons.  Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`,
+    photographs of the same size share a camera if EXIF names the same lens for them, or no lens.  Raises DataError
+    when fewer than three photographs can be read.
     """
     pycolmap = require_pycolmap()
     names, read_errors = gather(photographs, out / IMAGES, list_photographs(photographs, excluded_folder))

@@ -89,15 +89,15 @@ def require_photographs(folder: Path, excluded_folder: Path | None = None) -> No
 def _conversion_hints(unreadable_names: list[str]) -> list[str]:
     """For each format that cannot be read, return a sentence with a command that converts its files."""
     hints = []
-    for kind, (suffixes, command) in CONVERTERS.items():
+    for format_name, (suffixes, command) in CONVERTERS.items():
         if names := [name for name in unreadable_names if Path(name).suffix.lower() in suffixes]:
-            unreadable_files = f"{pluralize(len(names), f'{kind} file')} cannot be read ({first_few(names)})"
+            unreadable_files = f"{pluralize(len(names), f'{format_name} file')} cannot be read ({first_few(names)})"
             hints.append(f"{unreadable_files}: convert to JPEG, for example with {command}")
     return hints
 
 
 def _photo_names(folder: Path, excluded_folder: Path | None) -> tuple[list[str], list[str]]:
-    """Return the sorted names of the photographs below a folder, and those in formats that cannot be read."""
+    """Return the sorted names of the photographs below a folder, and the names of files in unreadable formats."""
     require_folder(folder)
     names: list[str] = []
     unreadable_names: list[str] = []
@@ -149,17 +149,17 @@ def failure_reason(photograph: Path, error: DataError) -> str:
     """Return the reason why a photograph cannot be read: its actual format, or the message of `error`."""
     with suppress(OSError), open_regular(photograph) as file:
         head = file.read(12)
-        for kind, brands in BRANDS.items():
+        for format_name, brands in BRANDS.items():
             if head[4:8] == b"ftyp" and head[8:] in brands:
-                return OTHER_FORMAT.format(kind)
+                return OTHER_FORMAT.format(format_name)
     return str(error).removeprefix(f"{photograph}: ").partition(";")[0]
 
 
 def remedy_for(read_errors: Mapping[str, str]) -> str:
     """Return a remedy for photographs that cannot be read.  read_errors: reasons by name, from `gather`."""
     remedies = {f"the file is {content}": remedy for _, content, remedy in STARTS}
-    for kind in BRANDS:
-        remedies[OTHER_FORMAT.format(kind)] = f"convert {kind} files to JPEG, for example with {CONVERTERS[kind][1]}"
+    for name in BRANDS:
+        remedies[OTHER_FORMAT.format(name)] = f"convert {name} files to JPEG, for example with {CONVERTERS[name][1]}"
     sentences = [remedy for reason, remedy in remedies.items() if reason in read_errors.values()]
     if set(read_errors.values()) - remedies.keys():
         sentences.append("export the others again" if sentences else "export them again")
@@ -214,28 +214,28 @@ def _is_gathered(source: Path, target: Path) -> bool:
     return target.exists() and (not target.is_symlink() or target.resolve() == source.resolve())
 
 
-def log_warnings(figures: Mapping[str, Any]) -> None:
-    """Log a warning for photographs that a step omitted.  figures: the result of the step."""
-    for warning in warnings_for(figures):
+def log_warnings(statistics: Mapping[str, Any]) -> None:
+    """Log a warning about photographs that a step left out.  statistics: those returned by the step."""
+    for warning in warnings_for(statistics):
         LOG.warning("%s", warning)
 
 
-def warnings_for(figures: Mapping[str, Any]) -> list[str]:
-    """Return the warnings about photographs that a step left out.  figures: the result of the step."""
+def warnings_for(statistics: Mapping[str, Any]) -> list[str]:
+    """Return the warnings about photographs that a step left out.  statistics: those returned by the step."""
     warnings = []
-    if errors := figures.get("damaged"):
+    if errors := statistics.get("damaged"):
         names = [f"{name} ({reason})" for name, reason in errors.items()]
-        count = figures["photographs"] + len(names)
+        count = statistics["photographs"] + len(names)
         warnings.append(f"{len(names)} of {count} photos cannot be read: {first_few(names)}; {remedy_for(errors)}")
-    if missing_names := figures.get("not_registered"):
-        reasons = figures.get("reasons", {})
+    if missing_names := statistics.get("not_registered"):
+        reasons = statistics.get("reasons", {})
         examples = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing_names])
-        alternative = "" if figures.get("denser_tried") else ", or find more features (find_features.long_side)"
+        alternative = "" if statistics.get("denser_tried") else ", or find more features (find_features.long_side)"
         warnings.append(
-            f"{len(missing_names)} of {figures['registered'] + len(missing_names)} photos could not be placed and "
+            f"{len(missing_names)} of {statistics['registered'] + len(missing_names)} photos could not be placed and "
             f"are not used: {examples}; to place them, add photos from viewpoints in between{alternative}"
         )
-    if sizes := figures.get("other_models"):
+    if sizes := statistics.get("other_models"):
         counts = ", ".join([*map(str, sizes[:-1]), pluralize(sizes[-1], "photo")])
         warnings.append(
             f"only the largest model is used, without {pluralize(len(sizes), 'smaller model')} of {counts}: add "
@@ -244,14 +244,15 @@ def warnings_for(figures: Mapping[str, Any]) -> list[str]:
     return warnings
 
 
-def summarize_placement(figures: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a sentence with the number of placed photographs, their mean reprojection error, and the omitted ones.
+def summarize_placement(statistics: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a sentence with the number of placed photographs, the mean reprojection error, and the unused photographs.
 
-    figures: the result of `step_facts`.  The sentence is "" if they are incomplete.
+    statistics: the result of `read_statistics`.  Returns "" if they are incomplete.
     """
-    cameras = figures.get("map_cameras", {})
+    cameras = statistics.get("map_cameras", {})
     try:
-        faults = [f"{name} ({reason})" for name, reason in figures.get("find_features", {}).get("damaged", {}).items()]
+        read_errors = statistics.get("find_features", {}).get("damaged", {})
+        faults = [f"{name} ({reason})" for name, reason in read_errors.items()]
         reasons = cameras.get("reasons", {})
         unplaced = [f"{name} ({reasons[name]})" if name in reasons else str(name) for name in cameras["not_registered"]]
         count, unused_photos = int(cameras["registered"]), [*faults, *unplaced]

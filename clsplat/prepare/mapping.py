@@ -33,7 +33,7 @@ from clsplat.prepare.rotation_only import no_depth_reason
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
-ENOUGH = 0.9  # fraction of placed photographs from which no attempt with denser features follows
+ENOUGH = 0.9  # fraction of the photographs; if it is placed, no attempt with denser features follows
 DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
 DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01, min_side=1200)
 FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap raises the middle two
@@ -82,7 +82,7 @@ def map_cameras(
 ) -> dict[str, Any]:
     """Place cameras and points in at most `attempts` attempts, and write the largest model to sparse/0.
 
-    Returns figures for the log.  `mapper: global` is faster for many photographs; more than one thread is faster but
+    Returns statistics for the log.  `mapper: global` is faster for many photographs; more than one thread is faster but
     not bit-identical.  min_track_length: the number of photographs in which a point must be visible, 2 or 3.
     Raises DataError, with the likely reason, when no attempt places three photographs.
     """
@@ -92,10 +92,10 @@ def map_cameras(
     graph = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
     if reason := no_depth_reason(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photos {reason}")
-    models, best, extra_pairs, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
+    models, best, extra_pairs, tries = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
     for attempt in (first, *RETRIES):
         placed_count = models[0].num_reg_images() if models else 0
-        if count == attempts or placed_count == len(names) or (attempt.dense and placed_count >= ENOUGH * len(names)):
+        if tries == attempts or placed_count == len(names) or (attempt.dense and placed_count >= ENOUGH * len(names)):
             break
         if attempt.dense and not models and graph.has_unrelated_photographs():
             break  # denser features would not help: most photographs have nothing in common
@@ -104,7 +104,7 @@ def map_cameras(
                 continue
             if attempt is not first:
                 LOG.info("placed %d of %d photos; trying again with %s", placed_count, len(names), attempt.label)
-            count += 1
+            tries += 1
             candidates = _run_attempt(source, out, attempt, threads, models[:1], extra_pairs)
             if attempt.wider:
                 graph = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
@@ -199,14 +199,14 @@ def _fill_database(source: Path, out: Path, attempt: Attempt, pairs: Sequence[tu
 
 
 def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Write the first model to sparse/0; return its figures, and the sizes of the other models."""
+    """Write the first model to sparse/0; return its statistics, and the number of photographs that each model adds."""
     best = models[0]
     (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
     best.write(str(out / MODEL / "0"))
-    placed_names, new_counts, known_names = _names(best), list[int](), set[str]()
+    placed_names, new_counts, covered_names = _names(best), list[int](), set[str]()
     for model in models:
-        new_counts.append(len(_names(model) - known_names))
-        known_names |= _names(model)
+        new_counts.append(len(_names(model) - covered_names))
+        covered_names |= _names(model)
     return {
         "registered": len(placed_names),
         "not_registered": [name for name in names if name not in placed_names],

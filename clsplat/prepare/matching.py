@@ -61,7 +61,7 @@ def match_features(
     """Match all pairs of photographs, or each photograph with the `neighbors` next ones by name or by similarity.
 
     `auto` matches all pairs of up to 200 photographs; for more, each photograph with the most similar ones.  Returns
-    the matching that was used, and the number of pairs that match.  More than one thread is faster but not
+    the method that was used, and the number of pairs that match.  More than one thread is faster but not
     bit-identical: in about one of a hundred calls of pycolmap 4.2, two pairs get different matches.
     """
     pycolmap = require_pycolmap()
@@ -87,7 +87,7 @@ def max_pair_count(photographs: int, matching: Matching, neighbors: int) -> int:
 def match_database(database: Path, pairing: Pairing) -> Matching:
     """Match the pairs of a database that are not matched yet, as match_features does.
 
-    Returns the matching that was used: never `auto`.  Raises DataError when pycolmap fails.
+    Returns the method that was used: never `auto`.  Raises DataError when pycolmap fails.
     """
     pycolmap = require_pycolmap()
     count, matching, neighbors = len(image_names(pycolmap, database)), pairing.matching, pairing.neighbors
@@ -144,15 +144,16 @@ def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
                 "'%s': COLMAP's pair lists do not allow spaces in names, so no further pairs are matched", bad_names[0]
             )
             images = [image for image in images if not _has_space(image.name)]
-        targets = [image.name in unplaced for image in images]
+        is_unplaced = [image.name in unplaced for image in images]
         candidates = [
             (i, j)
             for i, j in combinations(range(len(images)), 2)
-            if (targets[i] or targets[j]) and not db.exists_two_view_geometry(images[i].image_id, images[j].image_id)
+            if (is_unplaced[i] or is_unplaced[j])
+            and not db.exists_two_view_geometry(images[i].image_id, images[j].image_id)
         ]
         if len(candidates) > max_pairs:
             similarities = similarity(_descriptors(db, images))
-            candidates = _closest_pairs(candidates, similarities, targets, max(1, max_pairs // sum(targets)))
+            candidates = _closest_pairs(candidates, similarities, is_unplaced, max(1, max_pairs // sum(is_unplaced)))
     return [(images[i].name, images[j].name) for i, j in candidates]
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from clsplat.prepare.database import open_database
 from clsplat.prepare.diagnosis import FEW_MATCHES, connected_groups
 
-MAX_PAIRS = 120  # pairs to test, evenly spaced in order of their numbers of matches
+MAX_PAIRS = 120  # pairs to test, spaced evenly after sorting by the number of matches
 MAX_RESIDUAL = 3.0  # px: largest residual of a match that a homography explains, and largest motion of a static point
 MIN_EXPLAINED = 0.9  # fraction of the matches of a pair, and of the pairs
 FOCALS = np.geomspace(0.4, 4.0, 47)  # focal lengths to try, as fractions of the longer side
@@ -67,8 +67,8 @@ class _Pair:
 
         The unit is the longer side of a photograph, the origin its center.
         """
-        (first, _), (second, pixel) = map(self.points_of, self.photographs)
-        return first[self.matches[:, 0]], second[self.matches[:, 1]], pixel
+        (first, _), (second, pixel_size) = map(self.points_of, self.photographs)
+        return first[self.matches[:, 0]], second[self.matches[:, 1]], pixel_size
 
 
 def _good_pairs(pycolmap: ModuleType, db: Any, image_ids: Set[int]) -> list[_Pair]:
@@ -88,14 +88,14 @@ def _good_pairs(pycolmap: ModuleType, db: Any, image_ids: Set[int]) -> list[_Pai
     return sorted(good_pairs, key=lambda pair: -len(pair.matches))
 
 
-def _is_still(first: Floats, second: Floats, pixel: float) -> bool:
+def _is_still(first: Floats, second: Floats, pixel_size: float) -> bool:
     """Return whether the points of two photographs do not move, so that the pair does not show the camera's motion."""
-    return bool(np.median(np.linalg.norm(second - first, axis=1)) < MAX_RESIDUAL * pixel)
+    return bool(np.median(np.linalg.norm(second - first, axis=1)) < MAX_RESIDUAL * pixel_size)
 
 
-def _homography(first: Floats, second: Floats, pixel: float) -> Floats | None:
+def _homography(first: Floats, second: Floats, pixel_size: float) -> Floats | None:
     """Return the homography, [3, 3], that explains nearly all matches of a pair, or None if there is none."""
-    matrix, inliers = cv2.findHomography(first, second, cv2.RANSAC, MAX_RESIDUAL * pixel)
+    matrix, inliers = cv2.findHomography(first, second, cv2.RANSAC, MAX_RESIDUAL * pixel_size)
     if matrix is None or inliers.mean() < MIN_EXPLAINED:
         return None
     return np.asarray(matrix, np.float64)

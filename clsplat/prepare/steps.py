@@ -43,24 +43,24 @@ class Step(Settings):
         """Return whether `source`, such as a scene with cameras, needs neither this step nor any later step."""
         return False
 
-    def pieces(self, photographs: int) -> tuple[int, str]:
+    def count_items(self, photographs: int) -> tuple[int, str]:
         """Return the number of items that the step processes for a number of photographs, and their plural name."""
         return photographs, "photos"
 
     @abstractmethod
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
-        """Write the result for `source` into the folder `out`, and return figures for the log.
+        """Write the result for `source` into the folder `out`, and return statistics for the log.
 
         `out` is empty.  If the step `resumes`, it may contain the files of an interrupted call with the same inputs.
         Files in `excluded_folder` are not read.
         """
 
-    def summary(self, figures: dict[str, Any]) -> str:
-        """Return a log line that summarizes the figures returned by `make`."""
-        return ", ".join([f"{self.stage} finished", *(f"{value} {name}" for name, value in figures.items())])
+    def summary(self, statistics: dict[str, Any]) -> str:
+        """Return a log line that summarizes the statistics returned by `make`."""
+        return ", ".join([f"{self.stage} finished", *(f"{value} {name}" for name, value in statistics.items())])
 
-    def warnings(self, figures: dict[str, Any]) -> list[str]:
-        """Return the warnings for the figures of `make`, which are repeated when its result is reused."""
+    def warnings(self, statistics: dict[str, Any]) -> list[str]:
+        """Return the warnings for the statistics of `make`.  They are repeated when its result is reused."""
         return []
 
 
@@ -96,12 +96,12 @@ class FindFeatures(Step):
         options = FeatureOptions(self.long_side, self.features)
         return find_features(source, out, options, self.camera_model, self.cameras, excluded_folder.resolve())
 
-    def summary(self, figures: dict[str, Any]) -> str:
-        photographs = pluralize(figures["photographs"], "photo")
-        return f"features found in {photographs} from {pluralize(figures['cameras'], 'camera')}"
+    def summary(self, statistics: dict[str, Any]) -> str:
+        photographs = pluralize(statistics["photographs"], "photo")
+        return f"features found in {photographs} from {pluralize(statistics['cameras'], 'camera')}"
 
-    def warnings(self, figures: dict[str, Any]) -> list[str]:
-        return warnings_for(figures)
+    def warnings(self, statistics: dict[str, Any]) -> list[str]:
+        return warnings_for(statistics)
 
 
 class MatchFeatures(Step):
@@ -119,14 +119,14 @@ class MatchFeatures(Step):
     threads: Positive = 1
     """Number of threads; more than one is faster, but results are not always bit-identical."""
 
-    def pieces(self, photographs: int) -> tuple[int, str]:
+    def count_items(self, photographs: int) -> tuple[int, str]:
         return max_pair_count(photographs, self.matching, self.neighbors), "pairs"
 
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return match_features(source, out, self.matching, self.neighbors, self.threads)
 
-    def summary(self, figures: dict[str, Any]) -> str:
-        return f"{pluralize(figures['pairs'], 'pair')} of photos match"
+    def summary(self, statistics: dict[str, Any]) -> str:
+        return f"{pluralize(statistics['pairs'], 'pair')} of photos match"
 
 
 class MapCameras(Step):
@@ -156,11 +156,11 @@ class MapCameras(Step):
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.min_track_length)
 
-    def summary(self, figures: dict[str, Any]) -> str:
-        return summarize_placement({self.stage: figures})
+    def summary(self, statistics: dict[str, Any]) -> str:
+        return summarize_placement({self.stage: statistics})
 
-    def warnings(self, figures: dict[str, Any]) -> list[str]:
-        return warnings_for(figures)
+    def warnings(self, statistics: dict[str, Any]) -> list[str]:
+        return warnings_for(statistics)
 
 
 class Undistort(Step):
@@ -180,5 +180,5 @@ class Undistort(Step):
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}
 
-    def summary(self, figures: dict[str, Any]) -> str:
-        return f"photos undistorted to {pluralize(figures['images'], 'pinhole image')}"
+    def summary(self, statistics: dict[str, Any]) -> str:
+        return f"photos undistorted to {pluralize(statistics['images'], 'pinhole image')}"

@@ -37,12 +37,12 @@ def undistort_scene(
     views, counter = [], ItemCounter("photos undistorted", len(names))
     for i, (view, name) in enumerate(zip(scene.views, names, strict=True), 1):
         pinhole_view = replace(_downscale(_with_lens(view, undefined_pixels), long_side), alpha="mask")
-        image, mask = out / "images" / name, out / "masks" / name
-        if manifest.needs_writing(image, _source_hash(pinhole_view), mask):
+        image_path, mask_path = out / "images" / name, out / "masks" / name
+        if manifest.needs_writing(image_path, _source_hash(pinhole_view), mask_path):
             is_valid = load_mask(pinhole_view)
             if is_valid is not None and not is_valid.all():
-                write_image(mask, np.repeat(np.where(is_valid, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
-            write_image(image, load_image(pinhole_view))
+                write_image(mask_path, np.repeat(np.where(is_valid, 255, 0).astype(np.uint8)[:, :, None], 3, axis=2))
+            write_image(image_path, load_image(pinhole_view))
         views.append(replace(pinhole_view, lens=None))
         counter.reach(i)
     write_exposures(out / "images", dict(zip(names, load_exposures(scene.views), strict=True)))

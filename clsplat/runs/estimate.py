@@ -75,7 +75,7 @@ def _preparation_estimates(planned_steps: Sequence[PlannedStep], photo_count: in
     """Yield an estimate for each preparation step that is due."""
     for planned_step in planned_steps:
         if planned_step.reason and (seconds := planned_step.step.seconds) is not None:
-            count, unit = planned_step.step.pieces(photo_count)
+            count, unit = planned_step.step.count_items(photo_count)
             yield Estimate(planned_step.step.stage, (seconds[0] * count, seconds[1] * count), f"{count:,} {unit}")
 
 

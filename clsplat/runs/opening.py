@@ -19,7 +19,7 @@ from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import content_hashes
 from clsplat.pipeline.loading import Pipeline, apply_adaptation, prepared_folder
 from clsplat.pipeline.stretching import map_trainings
-from clsplat.prepare.cache import PlannedStep, make_note, prepare, read_note, step_facts
+from clsplat.prepare.cache import PlannedStep, make_note, prepare, read_note, read_statistics
 from clsplat.prepare.gather import list_photographs
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.estimate import estimate_time
@@ -124,7 +124,7 @@ def open_run(
         folder = prepare(planned_steps, folder, root, status.stage)
         with status.stage(READ_SCENE):
             run = make_run(pipeline, read(pipeline.settings.scene, folder), opened_device, out, status)
-    run.prepared, run.preparation = make_note(planned_steps) if planned_steps else None, step_facts(planned_steps)
+    run.prepared, run.preparation = make_note(planned_steps) if planned_steps else None, read_statistics(planned_steps)
     return run
 
 

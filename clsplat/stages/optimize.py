@@ -365,7 +365,7 @@ class Optimize(ValidatedTraining):
         offload_harmonics(run)
         run.adam = run.adam or Adam(gaussians)
         context = run.rasterizer, run.model, run.adam, run.stats, photographs.background
-        rates = self.rates.resolve(views.full_size(last_step))
+        rates = self.rates.resolve(views.first_large_step(last_step))
         states: list[ModuleState] = attach_modules(self.modules, run, last_step)
         if self.views_per_update != 1:
             attach_gradients(gaussians)
@@ -403,7 +403,7 @@ class Optimize(ValidatedTraining):
         """Return the losses and gradients of a view, and the names of the parameters not to update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
-        photograph = run.photographs.get_usable(sample.view, sample.original, sample.number)
+        photograph = run.photographs.get_unmasked(sample.view, sample.original, sample.index)
         offsets = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
         run.photographs.prefetch(sampler.at(run.step + offset).view for offset in offsets)
         frozen = {name for stage in self.during if stage.is_due(run.step) for name in stage.frozen_parameters(run)}

@@ -16,7 +16,7 @@ from clsplat.density.control import Box
 from clsplat.density.survey import WEIGHT, RenderedView
 from clsplat.gaussians.model import Model
 from clsplat.opencl.device import Device
-from clsplat.photos.photographs import BUDGET_SHARE, Photographs
+from clsplat.photos.photographs import BUDGET_FRACTION, Photographs
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
@@ -311,7 +311,7 @@ class Partitioner:
         """Return the device memory for training, in bytes.  gaussians: initial count; views: indices of views."""
         cameras = [self.views[view].camera for view in views]
         sizes = [4 * camera.width * camera.height for camera in cameras]
-        cached_bytes = min(int(BUDGET_SHARE * self.device.info.memory), sum(sizes))
+        cached_bytes = min(int(BUDGET_FRACTION * self.device.info.memory), sum(sizes))
         motion = self.model.motion
         tables = table_widths(self.model.sh_degree, 0 if motion is None else motion.shape[1])
         return plan(self.device.info, tables, cached_bytes, max(sizes) // 4).required_bytes(gaussians)

@@ -125,7 +125,7 @@ def test_pages(runs, tiny_scene, tmp_path):
     command("compare", *runs, "--out", tmp_path / "a.html")
     assert clsplat.compare_runs(runs, tmp_path / "b.html") == 2
     command("inspect", tiny_scene, "--html", tmp_path / "c.html")
-    assert clsplat.inspect_scene(tiny_scene, tmp_path / "d.html").trainable
+    assert clsplat.inspect_scene(tiny_scene, tmp_path / "d.html").is_trainable
     for one, other in ("ab", "cd"):
         assert (tmp_path / f"{one}.html").read_bytes() == (tmp_path / f"{other}.html").read_bytes()
 

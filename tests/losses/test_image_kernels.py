@@ -100,7 +100,7 @@ def test_mask_blackens_excluded_pixels(device, rng, width, height):
     photograph = Photograph(camera, device.upload(colors), device.upload(mask))
     assert photograph.nbytes == 4 * width * height
     np.testing.assert_array_equal(photograph.image(), colors.transpose(1, 2, 0))
-    np.testing.assert_array_equal(photograph.counted_pixels(), mask[0] > 0)
+    np.testing.assert_array_equal(photograph.unmasked_pixels(), mask[0] > 0)
     workspace = Workspace(device)
     planes = photograph.planes(workspace)
     before, counted = planes.colors.get(), planes.mask.get()
@@ -114,5 +114,5 @@ def test_mask_blackens_excluded_pixels(device, rng, width, height):
 def test_photograph_without_a_mask_counts_everywhere(device, rng):
     photograph = Photograph(make_camera(device, 5, 3), device.upload(rng.integers(0, 256, (3, 3, 5)).astype(np.uint8)))
     assert photograph.planes(Workspace(device)).mask is None
-    assert photograph.counted_pixels() is None
+    assert photograph.unmasked_pixels() is None
     assert photograph.nbytes == 45

@@ -135,7 +135,7 @@ def test_gradient_is_the_sum_over_all_losses(device, rng, learn, masked):
     losses = [L1(weight=0.8), Dssim(weight=0.2), L2(weight=3.0), Anisotropy(above=1.0)]
     trainer, haar, photograph = trainer_of(device, rng, losses, masked, learn=learn, weight=0.01)
     haar.scalars = {name: 0.31 + 0.4 * i for i, name in enumerate(NAMES[learn])}
-    before, counted = dict(haar.scalars), photograph.counted_pixels()
+    before, counted = dict(haar.scalars), photograph.unmasked_pixels()
     view = trainer.differentiate(photograph, 1)
     image = view.comparison.image.get()[:, :30, :41].astype(np.float64)
     colors = photograph.image().transpose(2, 0, 1) / 255

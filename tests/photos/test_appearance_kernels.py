@@ -105,6 +105,6 @@ def test_mask_hides_pixels_regardless_of_their_colors(device, rng):
     case = Case(device, rng, Affine(), share=0.5)
     case.scalars.update({key: 0.2 for key in case.trainer.modules[0].table.keys("b") if key.endswith("1")})
     image = case.trainer.compare(case.photograph, 1).comparison.image.get()[:, :36, :50]
-    hidden = ~case.photograph.counted_pixels()
+    hidden = ~case.photograph.unmasked_pixels()
     assert (image[:, hidden] == 0).all()
     assert (image[:, ~hidden] > 0.1).all()

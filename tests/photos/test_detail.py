@@ -88,7 +88,7 @@ def test_settings_that_follow_detail_are_resolved_before_use():
     resolved = views.resolve(lambda: [image])
     assert resolved.divisor(1) > 1
     assert resolved.divisor(1000) == 1
-    full = resolved.full_size(1000)
+    full = resolved.first_large_step(1000)
     assert resolved.divisor(full) == 1 < resolved.divisor(full - 1)
     assert resolved.resolve(lambda: []) is resolved
 

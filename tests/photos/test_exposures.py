@@ -35,7 +35,7 @@ def test_gains_are_recovered(rng):
     assert table(result) == pytest.approx(wall.log_gains, abs=2e-3)
     assert result.spread == pytest.approx(np.std(wall.log_gains @ [0.299, 0.587, 0.114]), abs=2e-3)
     assert result.explained_variance > 0.95
-    assert f"exposures of 8 photos differ by {result.spread:.1%} at 400 points" in result.text
+    assert f"exposures of 8 photos differ by {result.spread:.1%} at 400 points" in result.summary
 
 
 def test_exif_fills_in_for_photographs_without_tracks(rng):
@@ -52,8 +52,8 @@ def test_exif_fills_in_for_photographs_without_tracks(rng):
     for name, gains in truth.items():
         assert result.log_gains[name] == pytest.approx(gains, abs=3e-3)
     assert table(result).mean(axis=0) == pytest.approx(0, abs=1e-12)
-    assert result.text.startswith("exposures of 8 photos differ by")
-    assert result.text.endswith(", those of 2 as noted")
+    assert result.summary.startswith("exposures of 8 photos differ by")
+    assert result.summary.endswith(", those of 2 as noted")
     assert result.explained_variance == shown.explained_variance
 
 
@@ -66,7 +66,7 @@ class Photograph:
     def image(self) -> np.ndarray:
         return self.pixels
 
-    def counted_pixels(self) -> None:
+    def unmasked_pixels(self) -> None:
         return None
 
 
@@ -84,7 +84,7 @@ def test_run_starts_from_tracks_and_exif(rng, tmp_path):
         status=SimpleNamespace(counted=lambda views, *_: views),
     )
     result = estimate_exposures(run)
-    assert result.text.endswith("those of 1 by EXIF")
+    assert result.summary.endswith("those of 1 according to EXIF")
     assert result.log_gains["2.png"].mean() == pytest.approx(wall.log_gains[2].mean(), abs=0.01)
 
 

@@ -241,7 +241,7 @@ def test_each_unregistered_photograph_has_a_reason(tmp_path):
 def test_failed_mapping_is_described_by_groups(tmp_path):
     result = matched(tmp_path)
     assert diagnose(result) == (
-        "they do not connect: 2 groups with good matches, the largest of 5 (a, b, blurred, c, many), and 5 "
+        "they do not connect: 2 groups with good matches, the largest with 5 (a, b, blurred, c, many), and 5 "
         "without a good match (alone, elsewhere, few, plain, soft); take photos of one scene, with more overlap"
     )
     joined = replace(result, pairs={**result.pairs, ("a", "pair"): 30})
@@ -249,7 +249,7 @@ def test_failed_mapping_is_described_by_groups(tmp_path):
     weak = replace(result, pairs={("a", "b"): 20, ("b", "c"): 29})
     assert diagnose(weak).startswith("no two of them overlap enough: 29 matches at most; take")
     two = MatchGraph(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
-    assert "the largest of 2 (a, b), and 1 without a good match (c); take" in diagnose(two)
+    assert "the largest with 2 (a, b), and 1 without a good match (c); take" in diagnose(two)
 
 
 def test_blur_differs_from_a_soft_but_sharp_photograph(tmp_path):

@@ -248,9 +248,9 @@ def test_trainable_means_readable_by_a_reader(tmp_path_factory, kind: str, data:
         if scene.points is not None:
             require_points_in_front(scene.points, scene)
     except DataError:
-        assert not inspection.trainable
+        assert not inspection.is_trainable
     else:
-        assert inspection.trainable, inspection.verdict
+        assert inspection.is_trainable, inspection.verdict
 
 
 # ---- warnings and notes

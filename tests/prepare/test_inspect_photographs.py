@@ -38,7 +38,7 @@ def test_photographs_without_cameras_get_a_verdict(tmp_path, capsys):
     command = f"`clsplat run photos --scene {tmp_path}`"
     inspection = Inspection.from_folder(tmp_path)
     assert (inspection.verdict, inspection.findings) == (f"cameras are not known yet; next: {command}", [])
-    assert not inspection.trainable, "as it is"
+    assert not inspection.is_trainable, "as it is"
     assert summarize(inspection.facts)["sizes"] == "64x48"
     assert run_command("inspect", tmp_path).stdout.endswith(f"cameras are not known yet; next: {command}\n")
 

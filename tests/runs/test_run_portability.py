@@ -53,7 +53,7 @@ def test_model_of_a_run_has_its_scene(done, tiny_scene):
 def test_run_folder_is_a_scene(done, tiny_scene, tmp_path):
     assert photo_folder(done) == tiny_scene
     assert photo_folder(tiny_scene) == tiny_scene
-    assert clsplat.inspect_scene(done).trainable
+    assert clsplat.inspect_scene(done).is_trainable
     assert Job.open("smoke", done, tmp_path / "run").work.settings.scene.folder == tiny_scene
     moved = shutil.copytree(done, tmp_path / "moved")
     (moved / "prepared.json").write_text('{"inputs": "x", "folder": "/nowhere"}')

@@ -98,7 +98,7 @@ def test_damage_is_reported_with_file_and_line(scene, line, old, new):
     file.write_text("\n".join(lines) + "\n")
     message = refusal(read_scene, scene / "images")
     assert f"{file}: line {line}: " in message
-    assert not Inspection.from_folder(scene / "images").trainable
+    assert not Inspection.from_folder(scene / "images").is_trainable
 
 
 @pytest.mark.usefixtures("_plugin")

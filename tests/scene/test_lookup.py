@@ -112,7 +112,7 @@ def test_photograph_is_refused(tmp_path: Path, case: str) -> None:
     (error,) = [finding.text for finding in inspection.findings if finding.level == "error"]
     assert "registered images are missing on disk" in error
     assert "skip" in error or len(names) == 1 or "2 of 2" in error
-    assert not inspection.trainable
+    assert not inspection.is_trainable
 
 
 def test_links_out_of_the_scene_are_not_followed(tmp_path: Path) -> None:
@@ -242,7 +242,7 @@ def test_photographs_of_several_sizes_need_no_sizes(tmp_path: Path) -> None:
     table = json.loads((scene / "transforms.json").read_text())
     (scene / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": table["frames"]}))
     assert [(view.camera.width, view.camera.height) for view in read_scene(scene).views] == [(64, 48), (48, 64)]
-    assert Inspection.from_folder(scene).trainable
+    assert Inspection.from_folder(scene).is_trainable
 
 
 def test_only_photograph_is_trained_on_without_holdout(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ def test_inspect_reports_timestamps_and_cameras(folder):
     inspection = Inspection.from_folder(folder)
     assert summarize(inspection.facts)["times"] == "6 timestamps from 3 cameras"
     assert not inspection.facts.same_pose
-    assert inspection.trainable
+    assert inspection.is_trainable
 
 
 def timed(*times: float, **values: object) -> list[dict]:
@@ -147,7 +147,7 @@ def test_invalid_times_are_refused_with_their_location(tmp_path, times, message)
     fault = refusal(read_scene, path)
     assert all(part in fault for part in message.split(".*")), fault
     inspection = Inspection.from_folder(path)
-    assert not inspection.trainable
+    assert not inspection.is_trainable
     assert any(message.split(".*")[-1] in finding.text for finding in inspection.findings)
 
 

@@ -113,7 +113,7 @@ def test_reader_needs_only_matches_and_read_for_inspection(grid):
     assert is_scene(grid)
     inspection = Inspection.from_folder(grid)
     facts, parts = inspection.facts, inspection.parts
-    assert inspection.trainable
+    assert inspection.is_trainable
     assert (facts.kind, facts.registered, facts.on_disk, facts.train, facts.test) == ("grid", 4, 4, 3, 1)
     assert (facts.points.count, facts.points.error_mean) == (2, None)
     assert parts.points.rgb.tolist() == [[255, 0, 51], [0, 0, 0]]

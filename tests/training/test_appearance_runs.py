@@ -121,7 +121,7 @@ def test_decision_is_recorded_and_off_keeps_the_bits(tiny_scene, tmp_path, few_s
     run_pipeline(pipeline, RunState.read(tmp_path / "run"), None, "new")
     actual = load(str(tmp_path / "run" / "pipeline.yaml")).settings.training.modules[0]
     assert actual.chosen == "off"
-    assert actual.reason == "neither tracks nor EXIF give exposures"
+    assert actual.reason == "neither tracks nor EXIF gives exposures"
     assert f"optimize.modules.exposure: off, since {actual.reason}" in (tmp_path / "run" / "log.txt").read_text()
     assert digest(tmp_path / "run") == digest(few_steps)
     assert RunState.read(tmp_path / "run").is_complete(pipeline), "the same command finds it up to date"
@@ -156,7 +156,7 @@ def test_reason_names_the_deciding_bound(spread, explained, chosen, said):
     exposures = Exposures({"a": np.full(3, spread), "b": np.full(3, -spread)}, "at 9 points", explained)
     run = SimpleNamespace(scene=SimpleNamespace(split=lambda _: []), cache={("colors", ()): exposures})
     result = Exposure(when="auto").resolve_auto(run)
-    assert (result.chosen, result.reason) == (chosen, exposures.text + said)
+    assert (result.chosen, result.reason) == (chosen, exposures.summary + said)
 
 
 def test_decision_is_not_written_as_a_setting():

@@ -38,7 +38,7 @@ def test_transparent_pixels_get_the_drawn_color(tiny_scene):
 
     on_white = load_image(view, (1.0, 1.0, 1.0)) / 255
     np.testing.assert_allclose(shown(), on_white, atol=1e-6)  # transparency is not kept unless it is asked for
-    photographs.keep_transparency()
+    photographs.enable_transparency()
     expected = load_image(view, behind.get().astype(np.float64)) / 255
     assert np.abs(expected - on_white).max() > 0.3
     assert np.abs(shown() - expected).max() < 2.5 / 255

@@ -141,6 +141,6 @@ def test_mask_hides_pixels_regardless_of_their_colors(device, rng):
     values[1, [3, 7, 11]] = 0.2  # added to black
     case.state.load({}, {"values": values.reshape(case.state.shape)})
     image = case.trainer.compare(case.photograph, 1).comparison.image.get()[:, :HEIGHT, :WIDTH]
-    hidden = ~case.photograph.counted_pixels()
+    hidden = ~case.photograph.unmasked_pixels()
     assert (image[:, hidden] == 0).all()
     assert (image[:, ~hidden] > 0.1).all()

@@ -88,7 +88,7 @@ def test_growth_stops_at_the_memory_limit(tiny_scene, tmp_path, monkeypatch):
 
 
 def test_uncached_images_train_to_the_same_bits(tiny_scene, few_steps, tmp_path, monkeypatch):
-    monkeypatch.setattr("clsplat.photos.photographs.BUDGET_SHARE", 1e-10)
+    monkeypatch.setattr("clsplat.photos.photographs.BUDGET_FRACTION", 1e-10)
     assert train(tiny_scene, tmp_path / "tight", *FEW).photographs.budget < 100
     assert digest(tmp_path / "tight") == digest(few_steps)
 

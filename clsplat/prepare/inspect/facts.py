@@ -61,19 +61,17 @@ class ComparisonFacts:
     blurred: list[str]  # much blurrier than the others
     same: list[list[str]]  # groups of photographs that look the same
     jumps: list[tuple[str, str, float]]  # a photograph, the next one, and the stops between their EXIF exposures
-    steps: list[
-        tuple[str, str, float]
-    ]  # a photograph, the next one, and their brightness ratio, if EXIF lacks exposures
+    steps: list[tuple[str, str, float]]  # as `jumps`, with the ratio of brightness, for photographs without exposures
     unreadable: dict[str, str]  # photographs that cannot be decoded, by name, with the reason
     blank: list[str]  # black or of one color
 
 
-def compare_views(parts: Parts, missing: Container[Path]) -> ComparisonFacts:
+def compare_views(parts: Parts, missing_files: Container[Path]) -> ComparisonFacts:
     """Compare the photographs of a dataset's views, or all photographs in its folder if it has no views.
 
-    missing: paths of photographs that do not exist.
+    missing_files: paths of photographs that do not exist.
     """
-    views = [view for view in parts.views if view.image_path != NO_FILE and view.image_path not in missing]
+    views = [view for view in parts.views if view.image_path != NO_FILE and view.image_path not in missing_files]
     if not views:
         return compare_photos({os.path.relpath(f, parts.path).replace(os.sep, "/"): f for f in parts.disk_files})
     exposures: list[CameraExposure | None] = [None] * len(views)
@@ -123,17 +121,17 @@ def _measure_photo(file: Path) -> PhotographMeasures | DataError:
 
 
 def _brightness_steps(
-    brightness: Mapping[str, NDArray[np.float64]], exposed_names: Container[str]
+    brightness: Mapping[str, NDArray[np.float64]], names_with_exposure: Container[str]
 ) -> list[tuple[str, str, float]]:
     """Return adjacent photographs whose mean and median brightness both differ by a factor above MAX_BRIGHTNESS_RATIO.
 
-    If only the content differs, often only the mean or the median differs.  exposed_names: photographs with known
+    If only the content differs, often only the mean or the median differs.  names_with_exposure: photographs with known
     exposures; pairs of them are skipped.
     """
     steps = []
     for (name, x), (next_name, y) in pairwise(brightness.items()):
         ratios = y / x
-        if name in exposed_names and next_name in exposed_names:
+        if name in names_with_exposure and next_name in names_with_exposure:
             continue
         if min(ratios) > MAX_BRIGHTNESS_RATIO or max(ratios) < 1 / MAX_BRIGHTNESS_RATIO:
             steps.append((name, next_name, round(float(ratios[0]), 2)))
@@ -146,8 +144,8 @@ def _duplicates(names: Sequence[str], thumbnails: Sequence[NDArray[np.float32]])
     for i, thumbnail in enumerate(thumbnails):
         if thumbnail.std() <= MAX_DUPLICATE_RMS:
             continue
-        firsts = np.array([thumbnails[group[0]] for group in groups]).reshape(len(groups), len(thumbnail))
-        matches = np.flatnonzero(((firsts - thumbnail) ** 2).mean(axis=1) < MAX_DUPLICATE_RMS**2)
+        first_thumbnails = np.array([thumbnails[group[0]] for group in groups]).reshape(len(groups), len(thumbnail))
+        matches = np.flatnonzero(((first_thumbnails - thumbnail) ** 2).mean(axis=1) < MAX_DUPLICATE_RMS**2)
         groups[matches[0]].append(i) if len(matches) else groups.append([i])
     return [[names[i] for i in group] for group in groups if len(group) > 1]
 
@@ -197,14 +195,14 @@ def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.float
 
 
 def _errors(parts: Parts, is_finite: NDArray[np.bool_]) -> NDArray[np.floating]:
-    """Return the known reprojection errors in px at the full size, computed from observations or read from the file."""
+    """Return the reprojection errors in px at the full size, computed from observations or read from the file."""
     errors = reprojection_errors(parts.scene.tracks, parts.scene.views) if parts.scene else None
     if errors is not None:
         return errors
     assert parts.points is not None
     error = parts.points.error[is_finite] if len(parts.points.error) else np.empty(0)
-    known_errors = error[np.isfinite(error) & (error > 0)]
-    return known_errors if len(np.unique(known_errors)) > 1 else np.empty(0)  # equal errors are a placeholder
+    valid_errors = error[np.isfinite(error) & (error > 0)]
+    return valid_errors if len(np.unique(valid_errors)) > 1 else np.empty(0)  # equal errors are a placeholder
 
 
 def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
@@ -291,13 +289,13 @@ class Facts:
     same_pose: list[list[str]]  # groups of views with equal poses
     same_but_case: list[list[str]]  # groups of names that differ only in upper and lower case
     left_out: list[str]  # sentences about files that `prepare` does not read as photographs
-    hint: str  # names similar files that exist if files are missing
-    notes: list[str]  # sentences about files with paths other than the dataset contains
+    hint: str  # text that names similar files on disk, if files are missing
+    notes: list[str]  # sentences about files that were found under other paths than the dataset states
     faults: list[str]  # reasons why parts of the dataset cannot be read
     refusal: str  # reason why training does not start
 
     @property
-    def unplaced(self) -> bool:
+    def is_unplaced(self) -> bool:
         """Whether the dataset consists of photographs without cameras, for use with `clsplat run photos`."""
         return (
             self.kind == "none"
@@ -315,8 +313,8 @@ class Facts:
 def measure_dataset(parts: Parts) -> Facts:
     """Return all measurements of a dataset.  parts: as `read_parts` returns them."""
     views, expected = parts.views, parts.expected_files
-    missing = [file for file in expected if not os.path.exists(file)]  # Path.exists may raise
-    known_files = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
+    missing_files = [file for file in expected if not os.path.exists(file)]  # Path.exists may raise
+    listed_files = {*expected, *(view.mask_path for view in views), *(view.static_path for view in views)}
     names = [view.name for view in views]
     centers = np.stack([view.position for view in views]) if views else np.empty((0, 3))
     extent = (
@@ -333,13 +331,13 @@ def measure_dataset(parts: Parts) -> Facts:
         train=len(parts.scene.train) if parts.scene else None,
         test=len(parts.scene.test) if parts.scene else None,
         on_disk=len(parts.disk_files),
-        missing=[_relative_path(file, parts) for file in missing],
-        unregistered=[_relative_path(file, parts) for file in parts.disk_files if file not in known_files],
+        missing=[_relative_path(file, parts) for file in missing_files],
+        unregistered=[_relative_path(file, parts) for file in parts.disk_files if file not in listed_files],
         folders=len({file.parent for file in expected}),
         submodels=parts.submodels,
         cameras=_cameras(parts),
-        photos=_photographs(parts, set(missing)),
-        comparison=compare_views(parts, set(missing)),
+        photos=_photographs(parts, set(missing_files)),
+        comparison=compare_views(parts, set(missing_files)),
         capture=None if views else measure_capture(parts.disk_files),
         points=measure_points(parts, extent, centers) if parts.points else None,
         points_per_view=parts.observed if any(parts.observed.values()) else {},
@@ -420,9 +418,9 @@ def measure_capture(files: Sequence[Path]) -> CaptureFacts:
     return CaptureFacts(dict(sizes.most_common()), dict(cameras.most_common()), located_count)
 
 
-def _photographs(parts: Parts, missing: set[Path]) -> PhotographFacts:
+def _photographs(parts: Parts, missing_files: set[Path]) -> PhotographFacts:
     views = parts.views
-    decoded_files = decode_all(view for view in views if view.image_path not in missing)
+    decoded_files = decode_all(view for view in views if view.image_path not in missing_files)
     blank, no_content = list[str](), ""
     try:
         blank = require_content(parts.path, parts.scene.split("train") if parts.scene else views, decoded_files)

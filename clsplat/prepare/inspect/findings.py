@@ -45,13 +45,13 @@ class Finding:
 
 
 def check_photo_folder(facts: Facts) -> Iterator[Finding]:
-    """Yield findings about a folder of photographs without cameras, and about omitted files in the folder."""
+    """Yield findings about a folder of photographs without cameras, and about files in it that are not used."""
     count, read_errors = facts.on_disk, facts.comparison.unreadable
     if facts.kind != "none" or facts.faults or not (count or facts.left_out):
         return
     contents = f"{pluralize(count, 'photo')} but" if count else "no readable photos and"
     readable_count, warnings = count - len(read_errors), facts.left_out
-    if facts.unplaced:
+    if facts.is_unplaced:
         yield from _check_capture(facts, readable_count)
     else:
         remedy = f"only {readable_count} of {count} photos can be read; {remedy_for(read_errors)}"
@@ -65,7 +65,7 @@ def check_photo_folder(facts: Facts) -> Iterator[Finding]:
 def _check_capture(facts: Facts, readable_count: int) -> Iterator[Finding]:
     """Yield findings about photographs without cameras.  readable_count: the number of readable photographs."""
     if readable_count < MIN_VIEWS:
-        fault = f"there {_are(readable_count, 'photo', 'only ')}, from which cameras are often not found"
+        fault = f"there {_are(readable_count, 'photo', 'only ')}, often too few to find the cameras"
         yield Finding("warning", fault, TAKE_MORE)
     if blank := facts.comparison.blank:
         is_all_blank = len(blank) == readable_count
@@ -98,7 +98,7 @@ def findings(facts: Facts) -> list[Finding]:
         _check_points,
     )
     results = [finding for check in checks for finding in check(facts)]
-    if facts.refusal and not facts.unplaced and not any(finding.level == "error" for finding in results):
+    if facts.refusal and not facts.is_unplaced and not any(finding.level == "error" for finding in results):
         results.append(Finding("error", facts.refusal))
     return sorted(results, key=lambda finding: LEVELS.index(finding.level))
 
@@ -181,7 +181,7 @@ def _check_comparison(facts: Facts) -> Iterator[Finding]:
     if steps := facts.comparison.steps:
         examples = _join([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
         fault = f"{_are(len(steps), 'photo')} more than twice as bright or dark as the one before ({examples})"
-        remedy = "EXIF lacks an exposure; if it changed, --set optimize.modules.exposure={} gives each photo its own"
+        remedy = "without exposures in EXIF, --set optimize.modules.exposure={} fits the exposure of each photo"
         yield Finding("note", fault, remedy)
 
 
@@ -245,7 +245,7 @@ def _check_points(facts: Facts) -> Iterator[Finding]:
         return
     if points.count < MIN_POINTS:
         fault = f"there {_are(points.count, 'point', 'only ')}"
-        yield Finding("warning", fault, "try init: {source: random} as well")
+        yield Finding("warning", fault, "also try --set init.source=random")
     if points.not_finite:
         fault = f"{_are(points.not_finite, 'point')} not finite"
         yield Finding("warning", fault, "they are ignored; the file may be damaged: export it again")
@@ -297,7 +297,7 @@ class Inspection:
         return cls(parts, facts, findings(facts))
 
     @property
-    def trainable(self) -> bool:
+    def is_trainable(self) -> bool:
         """Whether training can use the dataset unchanged, which is not the case for photographs without cameras."""
         return self.next_step is None and all(finding.level != "error" for finding in self.findings)
 
@@ -305,7 +305,7 @@ class Inspection:
     def next_step(self) -> str | None:
         """Advice on finding the cameras of photographs.  None for datasets with cameras and unusable photographs."""
         facts = self.facts
-        if not facts.unplaced or any(finding.level == "error" for finding in self.findings):
+        if not facts.is_unplaced or any(finding.level == "error" for finding in self.findings):
             return None
         camera_folder = facts.refusal.partition("photos without cameras; the cameras are ")[2]
         command = f"`clsplat run photos --scene {shell_quote(facts.path)}`"
@@ -315,8 +315,8 @@ class Inspection:
     def verdict(self) -> str:
         """The findings in one sentence: the first error or warning, and the number of others."""
         errors, warnings = ([f.fault for f in self.findings if f.level == level] for level in ("error", "warning"))
-        findings, start, kind = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
-        more = f" (and {pluralize(len(findings) - 1, f'more {kind}')})" if len(findings) > 1 else ""
+        findings, start, noun = (errors, "cannot train: ", "error") if errors else (warnings, "trains, but ", "warning")
+        more = f" (and {pluralize(len(findings) - 1, f'more {noun}')})" if len(findings) > 1 else ""
         if self.next_step:
             problem = f", and {findings[0]}{more}" if findings else ""
             return f"cameras are not known yet{problem}; next: {self.next_step}"
@@ -326,7 +326,7 @@ class Inspection:
         """Return the verdict, findings and facts as plain data for JSON."""
         return {
             "verdict": self.verdict,
-            "trainable": self.trainable,
+            "trainable": self.is_trainable,
             "findings": [{"level": finding.level, "text": finding.text} for finding in self.findings],
             "facts": asdict(self.facts),
         }
@@ -339,7 +339,7 @@ MAX_CAMERAS = 4  # number of cameras to list
 
 def summarize(facts: Facts) -> dict[str, str]:
     """Return the main facts as a dict from labels to lines of text."""
-    fallback = "photos without cameras" if facts.unplaced else "none found"
+    fallback = "photos without cameras" if facts.is_unplaced else "none found"
     lines = {"dataset": facts.kind if facts.kind != "none" else fallback, "images": _image_counts(facts)}
     if capture := facts.capture:
         lines["sizes"] = _counts(capture.sizes)
@@ -356,7 +356,7 @@ def summarize(facts: Facts) -> dict[str, str]:
     if len(facts.submodels) > 1:
         lines["models"] = ", ".join(f"{name} ({pluralize(count, 'image')})" for name, count in facts.submodels.items())
     for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):
-        lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_line(camera)
+        lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_text(camera)
     if facts.extent is not None:
         lines["extent"] = f"{facts.extent:.4g} scene units, of the cameras"
         if facts.outlier_cameras:
@@ -382,8 +382,8 @@ def _counts(counts: Mapping[str, int]) -> str:
     return _join([f"{name} ({count})" if len(counts) > 1 else name for name, count in counts.items()])
 
 
-def camera_line(camera: CameraFacts) -> str:
-    """Return a line of text that describes a camera: model, size, focal length, distortion, and number of views."""
+def camera_text(camera: CameraFacts) -> str:
+    """Describe a camera in a line of text: model, size, focal length, distortion, and number of views."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
     distortion = "unbounded" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
@@ -415,6 +415,6 @@ def show(inspection: Inspection, console: Console) -> None:
     for finding in inspection.findings:
         table.add_row(Text(finding.level, STYLES[finding.level]), Text(finding.text))
     console.print(table, soft_wrap=not console.is_terminal)
-    if inspection.trainable or inspection.next_step:
+    if inspection.is_trainable or inspection.next_step:
         is_ready = inspection.verdict.startswith("ready")
         console.print(Text(inspection.verdict, "bold green" if is_ready else "bold yellow"))

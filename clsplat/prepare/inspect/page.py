@@ -14,7 +14,7 @@ from clsplat.scene.points import MAX_VALUE
 from clsplat.viewer.charts import camera_plans, histogram
 
 MAX_NAMES = 200  # names per list
-MAX_VIEWS = 8  # rows of the table of views with the lowest numbers of points
+MAX_VIEWS = 8  # rows of the table of views with the lowest point counts
 
 
 def write_page(inspection: Inspection, out: Path) -> None:

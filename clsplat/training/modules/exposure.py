@@ -121,13 +121,13 @@ class Appearance(TrainingModule):
             return self
         exposures = estimate_exposures(run)
         if not exposures.log_gains:
-            return self._choose("off", exposures.text)
+            return self._choose("off", exposures.summary)
         is_small = exposures.spread <= self.min_spread, exposures.explained_variance <= self.min_explained_variance
         bounds = f"{self.min_spread:.1%}", f"{self.min_explained_variance:.0%} of the variance"
         if not any(is_small):
-            return self._choose("on", f"{exposures.text}; more than {bounds[0]} and {bounds[1]}")
+            return self._choose("on", f"{exposures.summary}; more than {bounds[0]} and {bounds[1]}")
         small_bounds = " or ".join(itertools.compress(bounds, is_small))
-        return self._choose("off", f"{exposures.text}; not more than {small_bounds}")
+        return self._choose("off", f"{exposures.summary}; not more than {small_bounds}")
 
     def _choose(self, chosen: Literal["on", "off"], reason: str) -> "Appearance":
         level = logging.INFO if chosen == "on" else logging.DEBUG  # "off" changes nothing
@@ -273,7 +273,7 @@ class ColorState(ModuleState):
         exposures = estimate_exposures(run)
         self.start_from(exposures.log_gains)
         self.scalars[HAS_KNOWN] = float(bool(exposures.log_gains))
-        LOG.info("colors of photos: %s", exposures.text)
+        LOG.info("colors of photos: %s", exposures.summary)
 
     def prepare(self, run: Run, last_step: int, is_trained: bool = True) -> None:
         self.rate = self.settings.rate_schedule(last_step, len(self.names), self.scalars.get(HAS_KNOWN, 1.0) > 0)
@@ -375,7 +375,7 @@ def estimate_exposures(run: Run) -> Exposures:
 
         def read(view: View) -> tuple[NDArray[np.uint8], Mask | None]:
             photograph = run.photographs.get(view)
-            return photograph.image(), photograph.counted_pixels()
+            return photograph.image(), photograph.unmasked_pixels()
 
         progress = run.status.counted(views, "photos", len(views))
         exposures = measure_exposures(run.scene.tracks, progress, read) if run.scene.tracks else UNKNOWN

@@ -32,7 +32,7 @@ class RandomBackground(TrainingModule):
     def create_state(self, run: Run) -> ModuleState:
         if self.when == "transparent":
             LOG.info("training with a random background, since photos have transparent pixels")
-        run.photographs.keep_transparency()
+        run.photographs.enable_transparency()
         return RandomBackgroundState(run.device, run.seed)
 
 

@@ -104,7 +104,7 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
     evidence = _detect_skies(run, run.scene)
     if texels := panorama(evidence, side):
         return texels
-    upper_colors = [photo.upper.mean(axis=0) / 255 for photo in evidence if len(photo.upper)]
+    upper_colors = [photo.upper_pixels.mean(axis=0) / 255 for photo in evidence if len(photo.upper_pixels)]
     if not upper_colors:
         LOG.warning("masks exclude the upper thirds of all photos; the sky starts black")
     mean = np.mean(upper_colors, axis=0) if upper_colors else np.zeros(3)
@@ -116,4 +116,4 @@ def _detect_skies(run: Run, scene: Scene) -> list[SkyEvidence]:
     views = list({view.name: view for view in reversed(scene.split("train"))}.values())[::-1]
     progress = run.status.counted(views, "photos", len(views))
     photographs = ((view, run.photographs.get(view)) for view in progress)
-    return list(detect_sky(scene, ((view, photo.image(), photo.counted_pixels()) for view, photo in photographs)))
+    return list(detect_sky(scene, ((view, photo.image(), photo.unmasked_pixels()) for view, photo in photographs)))
