@@ -407,11 +407,11 @@ def run_worker(
     insecure: allow a connection without TLS
     """
     from clsplat.pipeline.execution import from_options
-    from clsplat.sweeps.dask import offer  # requires Dask
+    from clsplat.sweeps.dask import offer_devices  # requires Dask
 
     load_plugins()
     certificates = {key: file for key, file in zip(("ca", "cert", "key"), tls, strict=True) if file} or None
-    offer(from_options({"engine": scheduler, "insecure": insecure, "tls": certificates}), devices)
+    offer_devices(from_options({"engine": scheduler, "insecure": insecure, "tls": certificates}), devices)
 
 
 # Conversion of model files.

@@ -44,10 +44,10 @@ def render_views(
     alpha: also write NAME_alpha, in [0, 1], as arrays [height, width]
     time: render a moving model at this time, in [0, 1], instead of at the times of the views
     """
-    from clsplat.runs.model_file import KINDS, SPLITS, ModelFile
+    from clsplat.runs.model_file import FORMATS, SPLITS, ModelFile
 
     load_plugins()
-    for option, value, choices in (("split", split, SPLITS), ("kind", kind, KINDS)):
+    for option, value, choices in (("split", split, SPLITS), ("kind", kind, FORMATS)):
         if value not in choices:
             raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
     model_file = ModelFile(Path(model), to_path(scene), device, downscale)

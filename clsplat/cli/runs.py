@@ -175,9 +175,9 @@ def check(
         raise ConfigError("check: expected a pipeline, a run folder, a model, or --schema")
     result = commands.check(pipeline)
     if "objects" in result:
-        from clsplat.runs.verify import lines, verdict
+        from clsplat.runs.verify import format_files, verdict
 
-        _show_findings(result, as_json, lines(result), verdict(result), None if result["whole"] else OutputError)
+        _show_findings(result, as_json, format_files(result), verdict(result), None if result["whole"] else OutputError)
     elif "model" in result:
         from clsplat.gaussians.validate import format_report as model_lines
         from clsplat.gaussians.validate import verdict as model_verdict

@@ -44,7 +44,7 @@ def describe(
     """Describe what a run would do in a folder, one line per stage, without writing anything.
 
     read: function that reads the scene.  with_time: whether to add a time estimate for a new run.
-    Raises the errors that the run would raise before its first stage.  Photos are checked only if they are prepared.
+    Raises the errors that the run would raise before its first stage.  Photos are checked only after the preparation.
     """
     out = state.out
     actual_start = choose_start(pipeline, state, start)
@@ -81,9 +81,9 @@ def describe(
 
 
 def _expect_measures(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures | None, list[str]]:
-    """Return the expected measures of the photos to prepare, and a list of lines.
+    """Return the expected measures of the photos to prepare, and lines of text.
 
-    If the run would be refused even if all photos get a camera, the measures are None, and the line says why.
+    If the run would be refused even with a camera for every photo, the measures are None, and a line gives the reason.
     """
     try:
         return expected_measures(pipeline, names), []

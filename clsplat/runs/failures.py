@@ -34,7 +34,7 @@ class Failures(dict[str, ClsplatError]):
         self[name] = error
         LOG.warning("%s failed: %s", name, one_line(error))
 
-    def texts(self) -> dict[str, str]:
+    def messages(self) -> dict[str, str]:
         """Return the error of each part as one line, by name."""
         return {name: one_line(error) for name, error in self.items()}
 

@@ -161,7 +161,7 @@ def refuse_field(path: Path) -> None:
 
 def field_error(path: Path) -> DataError:
     """Return the error for a field file that is used where Gaussians are expected."""
-    remedy = "use `clsplat render`, after the stage export_field"
+    remedy = "use `clsplat render` on the file that the stage export_field writes"
     return DataError(f"{path}: is a field, which has a network instead of Gaussians; {remedy}")
 
 
@@ -235,11 +235,11 @@ def path_setting(folder: Path) -> str:
 
 FRAME = re.compile(r"frame_\d{5,6}(_[a-z]+)?\.[a-z]+")  # video frames; those of the path `views` are named like views
 LOG = logging.getLogger("clsplat")
-KINDS = ("png", "npy")  # file formats
+FORMATS = ("png", "npy")
 RECORD = ".renders.json"  # in the folder of renders: the name of each render, and whether it is a frame of a video
 
 
-def write_pictures(
+def write_renders(
     canvas: Canvas,
     views: Sequence[View],
     out: Path,
@@ -323,8 +323,8 @@ def _read_record(out: Path) -> dict[str, bool]:
     return {name: is_frame is True and FRAME.fullmatch(name) is not None for name, is_frame in entries.items()}
 
 
-def _write_record(out: Path, rendered: Mapping[str, bool]) -> None:
-    write_text(out / RECORD, json.dumps(rendered, indent=1, sort_keys=True) + "\n")
+def _write_record(out: Path, record: Mapping[str, bool]) -> None:
+    write_text(out / RECORD, json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
 SPLITS = ("train", "test", "all")
@@ -340,7 +340,7 @@ class ModelFile:
     def __init__(
         self, model: Path, scene: Path | None = None, device: str | Device | None = None, downscale: float | None = None
     ) -> None:
-        """downscale: divisor of the image size; default: the one used by the run, or 1 for a file."""
+        """downscale: divisor of the image size; default: that of the run, or 1 for a file."""
         self.source = ModelSource.from_model(model, scene)
         host_model = read(self.source.file)
         self.device = open_verified(device)
@@ -378,7 +378,7 @@ class ModelFile:
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
         images = [view.image_path for split in ("train", "test") for view in self.photographs.split(split)]
-        return len(write_pictures(Canvas(self.painter), views, out, kind, layers, images))
+        return len(write_renders(Canvas(self.painter), views, out, kind, layers, images))
 
     def evaluate(
         self, downscales: Sequence[float] | None = None, perceptual: Perceptual = PSNR_AND_SSIM

@@ -30,12 +30,10 @@ from clsplat.training.stage import Training
 
 
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
-    """Write the results of a run, and for each stage name the first output of the last such stage, to metrics.json."""
+    """Write the results of a run to metrics.json.  Its `files` are the first outputs of the last stage of each name."""
     training = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
-    seconds = {
-        **run.status.seconds,
-        training: run.train_seconds,
-    }  # of this process; training time includes earlier processes
+    # of this process, except for the training time, which includes earlier processes
+    seconds = {**run.status.seconds, training: run.train_seconds}
     output_paths = {stage.stage: path for stage in pipeline.stages for path in stage.outputs(run.out)[:1]}
     metrics = {
         "test": run.metrics.get("test", {}),

@@ -19,7 +19,7 @@ from clsplat.prepare.cache import read_note
 from clsplat.runs.state import RunState
 from clsplat.training.records import Records
 
-Points = list[tuple[float, float]]
+Curve = list[tuple[float, float]]  # x and y of its points
 
 
 class Averages(BaseModel):
@@ -38,7 +38,7 @@ class Averages(BaseModel):
         """The number of views in the mean of `psnr_color`."""
         return self.views if self.psnr_color_views is None else self.psnr_color_views
 
-    def figure(self, metric: str) -> float | None:
+    def value(self, metric: str) -> float | None:
         """Return a metric by its name; None if it was not measured."""
         value = getattr(self, metric, None)
         return float(value) if isinstance(value, int | float) else None
@@ -91,14 +91,14 @@ class RunFolder:
         return cls(path, settings, _scene(path, settings), read_metrics(path / METRICS))
 
     @property
-    def missing_plugins(self) -> list[str]:
+    def plugin_faults(self) -> list[str]:
         """A message for each plug-in of the run that is not loaded, or has changed since the run."""
         recorded_plugins = self.settings.get("plugins")
         faults = plugins.differences(recorded_plugins) if isinstance(recorded_plugins, dict) else []
         return [f"{self.path}: {fault}" for fault in faults]
 
     @property
-    def photographs(self) -> Path:
+    def photo_folder(self) -> Path:
         """The folder of the photos that the run trained on.  Raises ConfigError if the pipeline names no scene."""
         note = read_note(self.path)
         return Path(note["folder"]) if note else self.scene.folder
@@ -108,25 +108,25 @@ class RunFolder:
         """The lines of metrics.jsonl; empty if it is missing.  Raises DataError if it is damaged."""
         return Records(self.path).read()
 
-    def points(self, kind: str, figure: str, **conditions: Any) -> Points:
-        """Return points (step, figure) from all records of a kind, such as `train`, that match the conditions.
+    def curve(self, kind: str, metric: str, **conditions: Any) -> Curve:
+        """Return the points (step, metric) from all records of a kind, such as `train`, that match the conditions.
 
         conditions: values that a record must have, such as split="test".
         """
         records = (record for record in self.records if record["kind"] == kind)
         matches = (record for record in records if all(record.get(key) == value for key, value in conditions.items()))
-        return [(record["step"], record[figure]) for record in matches if isinstance(record.get(figure), int | float)]
+        return [(record["step"], record[metric]) for record in matches if isinstance(record.get(metric), int | float)]
 
-    def over_cpu_seconds(self, points: Points) -> Points:
-        """Convert points (step, figure) to (CPU seconds of training, figure); empty if no CPU times were recorded."""
-        times = [(0.0, 0.0), *self.points("train", "cpu_seconds")]
+    def over_cpu_seconds(self, curve: Curve) -> Curve:
+        """Convert a curve over steps to one over CPU seconds of training; empty if no CPU times were recorded."""
+        times = [(0.0, 0.0), *self.curve("train", "cpu_seconds")]
         if len(times) == 1:
             return []
         steps, cpu_seconds = zip(*times, strict=True)
-        return [(float(np.interp(step, steps, cpu_seconds)), value) for step, value in points]
+        return [(float(np.interp(step, steps, cpu_seconds)), value) for step, value in curve]
 
     @property
-    def renders(self) -> Path:
+    def render_folder(self) -> Path:
         """The folder of images of the last `render` stage.  Raises DataError if it is outside the run folder."""
         stages = [stage["render"] for stage in self.settings["stages"] if isinstance(stage, dict) and "render" in stage]
         folder = str((stages[-1] or {}).get("folder", "renders")) if stages else "renders"

@@ -60,7 +60,7 @@ def open_run_folder(state: RunState, start: Start, **values: Any) -> Iterator[St
             status = StatusFile(out, require_lock, **values)
             status.begin()
             try:
-                with closing(status):  # the next owner of the folder writes its own
+                with closing(status):  # the next owner of the folder writes another status
                     yield status
             except BaseException as error:
                 if old_status is not None and not status.has_run:
@@ -106,7 +106,7 @@ def clear(status: StatusFile) -> None:
             file.unlink(missing_ok=True)
 
 
-def _has_own_pipeline(state: RunState) -> bool:
+def _is_pipeline_from_run(state: RunState) -> bool:
     """Return whether a run or a matrix wrote the pipeline.yaml of a folder; True if there is no such file."""
     out = state.out
     if PIPELINE not in state.names or STATUS in state.names or state.checkpoints:
@@ -130,7 +130,7 @@ def check_run_folder(state: RunState, start: Start) -> None:
     out = state.out
     if start not in get_args(Start):
         raise ConfigError(f"start: expected one of {', '.join(get_args(Start))}, got '{start}'")
-    if not _has_own_pipeline(state):
+    if not _is_pipeline_from_run(state):
         raise ConfigError(f"{out / PIPELINE}: was not written by a run, and would be overwritten; use another folder")
     if start == "new" and state.phase >= Phase.BEGUN:
         raise ConfigError(f"{out}: already has a run; use another folder, --resume, or --restart")
@@ -138,19 +138,19 @@ def check_run_folder(state: RunState, start: Start) -> None:
         return
     if state.phase is Phase.DONE and "cells" not in state.status and not state.checkpoints:
         raise ConfigError(
-            f"{out}: is finished, but has no checkpoint to continue from; {state.restart} trains it again"
+            f"{out}: is finished, but has no checkpoint to continue from; {state.restart_command} trains it again"
         )
     if state.phase is Phase.STATELESS:
         raise OutputError(
             f"{out}: both {STATUS} and the checkpoints of its run are missing; restore them, or start over with "
-            f"{state.restart}"
+            f"{state.restart_command}"
         )
 
 
 # The default folder of a run, and checks whether a folder already has the results of a run.
 
 
-def free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunState:
+def find_free_folder(folder: Path, pipeline: Pipeline | None, start: Start) -> RunState:
     """Return the state of the default run folder, or of the next numbered folder that no other run uses."""
     number, state = 1, RunState.read(folder)
 

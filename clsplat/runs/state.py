@@ -76,7 +76,7 @@ class RunState:
 
     @cached_property
     def bad_files(self) -> list[str]:
-        """The files that are missing or changed, including the list of checksums itself for a finished run."""
+        """The files that are missing or changed; of a finished run, also checksums.json if it is missing."""
         if self.sums is None:
             return [CHECKSUMS] if self.phase is Phase.DONE and "cells" not in self.status else []
         return damaged_files(self.out, self.sums)
@@ -118,10 +118,10 @@ class RunState:
         names = [stage.stage for stage in stages if stage.is_due(steps)]
         if not names or self.status.get("step", 0) < steps:
             return ""
-        return f"'{names[0]}' was due at step {steps}, the last one, so the result differs from a run planned as long"
+        return f"'{names[0]}' was due at step {steps}, the last one, so the result differs from a single longer run"
 
     @property
-    def restart(self) -> str:
+    def restart_command(self) -> str:
         """The command that starts the run from the beginning, for messages."""
         pipeline = "…"
         with suppress(ConfigError):  # the pipeline is missing or damaged

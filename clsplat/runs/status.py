@@ -74,7 +74,7 @@ def status_text(status: dict[str, Any]) -> str:
     if status.get("silent", 0) >= HEARTBEAT_TIMEOUT:
         lines.append(f"no heartbeat for {status['silent']} s{_process(status)}")
     if status.get("ahead"):
-        lines.append(f"its clock is ahead by {status['ahead']} s{_process(status)}; whether it still runs is unknown")
+        lines.append(f"its clock is {status['ahead']} s ahead{_process(status)}; whether the run continues is unknown")
     if status.get("message"):
         lines.append(status["message"])
     if status["advice"]:
@@ -162,10 +162,10 @@ def _summary_lines(folder: Path, metrics: dict[str, Any]) -> Iterator[str]:
     placement = summarize_placement(metrics.get("preparation", {}))
     if best := metrics.get("kept"):
         model = "best     model of step {:,}" if not best["refit"] else "refit    {:,} steps on all photos"
-        yield f"  {model.format(best['step'])}, by a validation PSNR of {best['validation']:.2f} dB"
+        yield f"  {model.format(best['step'])}, chosen by a validation PSNR of {best['validation']:.2f} dB"
     yield f"  scene    {metrics['scene']}" + (f"; {placement}" if placement else "")
     files = {stage: folder / name for stage, name in metrics["files"].items()}
-    titles = {file: title for kind in variants(TrainingModule).values() for file, title in kind.side_files.items()}
+    titles = {file: title for module in variants(TrainingModule).values() for file, title in module.side_files.items()}
     paths_by_title = {
         titles.get(path.name) or TITLES.get(stage, stage): path for stage, path in files.items() if path.exists()
     }

@@ -21,7 +21,7 @@ def run_until_training(pipeline: Pipeline, run: Run) -> None:
 
 
 def train(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
-    """Run the stages from the first to the last training, and the edits after it; yield the losses of each step.
+    """Run the stages from the first to the last training, and the edits after it; yield the gradients of each step.
 
     A refit starts with the first stage again.
     """
@@ -37,12 +37,12 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
         stage = pipeline.stages[index]
         if isinstance(stage, Optimize):
             run.status.note(stage=stage.stage, progress=None)
-            for view in stage.iterate(run):
+            for gradients in stage.iterate(run):
                 if index == last_index and stage.has_ended(run) and not is_refit_due(run):
                     _run_final_edits(pipeline, run)
-                    yield view
+                    yield gradients
                     return
-                yield view
+                yield gradients
             if is_refit_due(run):
                 yield from train(full_pipeline, run)
                 return

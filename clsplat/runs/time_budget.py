@@ -32,7 +32,7 @@ from clsplat.training.status import StatusFile
 LOG = logging.getLogger("clsplat")
 CORRECTIONS = 0.3, 0.6, 0.85  # fractions of the training
 STEPS = 200  # of the first rehearsal; a training stage may declare a smaller number
-LONGER = 3  # factor of the number of steps of the next rehearsal
+LONGER = 3  # factor by which the next rehearsal has more steps
 MIN_FRACTION = 0.03  # of the budget; a shorter rehearsal is followed by a longer one
 REPORTS = 20  # minimum number per training; each contains the median time of the steps since the previous one
 MAX_FRACTION = 0.2  # of the budget; after this time, a rehearsal stops training
@@ -48,20 +48,20 @@ class Rehearsal:
 
     steps: int
     step_times: Sequence[float]  # mean time of one step in each of several equal parts of the training
-    during: float  # before the training, and between its steps
+    overhead: float  # before the training, and between its steps
     after: float  # after the training
     trend: float = 0.0  # exponent of the growth of a step's time with the number of steps
 
     def steps_in(self, seconds: float) -> int:
         """Return the number of training steps that fit into a total time, s."""
-        times = max(0.0, seconds - self.during - self.after) / (self.steps * fmean(self.step_times))
+        times = max(0.0, seconds - self.overhead - self.after) / (self.steps * fmean(self.step_times))
         return math.floor(self.steps * math.pow(times, 1 / (1 + self.trend)))
 
-    def later(self, fraction: float) -> tuple[float, float]:
+    def later_step_times(self, fraction: float) -> tuple[float, float]:
         """Return the mean and the final step time after a fraction of the training, relative to the step time there."""
         index = min(int(fraction * len(self.step_times)), len(self.step_times) - 1)
-        now = self.step_times[index]
-        return fmean(self.step_times[index:]) / now, self.step_times[-1] / now
+        current = self.step_times[index]
+        return fmean(self.step_times[index:]) / current, self.step_times[-1] / current
 
 
 class _RehearsalOver(Exception):
@@ -79,21 +79,20 @@ def execute_within(minutes: float, pipeline: Pipeline, run: Run, start: Start, s
     check_run(pipeline, run)
     rehearsal = rehearse_enough(pipeline, run, minutes, deadline)
     steps, planned_steps = pipeline.settings.training.steps, rehearsal.steps_in(deadline - time.perf_counter())
-    if planned_steps < min_steps_of(pipeline):
+    if planned_steps < min_training_steps(pipeline):
         raise _too_short_error(minutes, pipeline)
-    reason = f"--minutes {minutes:g}: {planned_steps:,} steps instead of {steps:,}, by a rehearsal"
+    reason = f"--minutes {minutes:g}: {planned_steps:,} steps instead of {steps:,}, based on a rehearsal"
     LOG.info("%s", reason)
     settings = _add_reports(stretch(pipeline.settings, Fraction(planned_steps, steps)))
     plan = replace(pipeline, settings=settings, reason=reason)
 
     def correct(plan: Pipeline, report: Progress) -> Pipeline:
         old_steps, fraction, step_time = report.steps, report.step / report.steps, report.milliseconds / 1e3
-        mean_step_time, last_step_time = (ratio * step_time for ratio in rehearsal.later(fraction))
-        remaining = rehearsal.after + (1 - fraction) * rehearsal.during + mean_step_time * (old_steps - report.step)
+        mean_step_time, last_step_time = (ratio * step_time for ratio in rehearsal.later_step_times(fraction))
+        remaining = rehearsal.after + (1 - fraction) * rehearsal.overhead + mean_step_time * (old_steps - report.step)
         change = math.floor((deadline - time.perf_counter() - remaining) / last_step_time)
-        minimum = min(
-            old_steps, last_edit(plan.settings.training) + 2
-        )  # stages that start after the last edit run once
+        # stages that start after the last edit run once
+        minimum = min(old_steps, last_edit(plan.settings.training) + 2)
         steps = max(report.step + 2, minimum, old_steps + change)
         reason = f"--minutes {minutes:g}: {steps:,} steps, corrected at step {report.step:,}"
         LOG.info("%s; %.0f ms per step", reason, report.milliseconds)
@@ -166,9 +165,9 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, deadline:
     reports: list[tuple[float, int, float]] = []  # time on the clock, s; step; time of one step, s
 
     def check_time() -> None:
-        # the first report may include the building of kernels
+        # the first report may include the time to build the kernels
         step_time = min(seconds for _, _, seconds in reports[-2:]) if len(reports) > 1 else 0.0
-        if time.perf_counter() + min_steps_of(pipeline) * step_time > deadline:
+        if time.perf_counter() + min_training_steps(pipeline) * step_time > deadline:
             raise _too_short_error(minutes, pipeline)
 
     def show(report: Progress) -> None:
@@ -189,12 +188,12 @@ def rehearse(pipeline: Pipeline, run: Run, steps: int, minutes: float, deadline:
             run_stages(short_pipeline, trial)
     training_end, completed_steps, _ = reports[-1]
     step_times = [seconds for _, _, seconds in reports]
-    during = (training_end - start_time - completed_steps * fmean(step_times)) * steps / completed_steps
+    overhead = (training_end - start_time - completed_steps * fmean(step_times)) * steps / completed_steps
     step_times += [step_times[-1]] * (round(len(step_times) * steps / completed_steps) - len(step_times))
-    return Rehearsal(steps, step_times, max(0.0, during), time.perf_counter() - training_end)
+    return Rehearsal(steps, step_times, max(0.0, overhead), time.perf_counter() - training_end)
 
 
-def min_steps_of(pipeline: Pipeline) -> int:
+def min_training_steps(pipeline: Pipeline) -> int:
     """Return the minimum number of training steps: that of a rehearsal, or more if edits would coincide."""
     training = pipeline.settings.training
     return max(min(STEPS, training.rehearsal_steps), min_steps(training))
@@ -237,6 +236,6 @@ def _require_single_training(pipeline: Pipeline) -> None:
 
 def _too_short_error(minutes: float, pipeline: Pipeline) -> ConfigError:
     return ConfigError(
-        f"--minutes {minutes:g}: too short: this scene needs at least {min_steps_of(pipeline)} steps on this device; "
+        f"--minutes {minutes:g}: too short: at least {min_training_steps(pipeline)} steps must fit on this device; "
         "use more minutes, or smaller images (--set scene.downscale=2)"
     )

@@ -48,7 +48,7 @@ def require_sum(expected: str | None, path: Path) -> None:
         raise DataError("does not match its checksum")
 
 
-def settings_file(state: RunState, settings: dict[str, Any], path: Path) -> str:
+def check_settings(state: RunState, settings: dict[str, Any], path: Path) -> str:
     settings.update(read_settings(state.out))
     require_sum((state.sums or {}).get(PIPELINE), path)
     if "matrix" in settings:
@@ -61,13 +61,13 @@ def settings_file(state: RunState, settings: dict[str, Any], path: Path) -> str:
     return ""
 
 
-def status_file(path: Path) -> str:
+def check_status(path: Path) -> str:
     content = read_json(path)
     status = parse_status(content)
     return status.state if status else f"not checked further: format {content['format']} of a newer version"
 
 
-def checkpoint_file(path: Path) -> str:
+def check_checkpoint(path: Path) -> str:
     if path.name.startswith("failed"):
         return f"the state of a failure at step {archive.read(path)[0].get('step')}"
     state, tables = checkpoint.load(path)
@@ -75,12 +75,12 @@ def checkpoint_file(path: Path) -> str:
     return f"step {state.step}, {size_text(gaussians, state.field['parameters'] if state.field else None)}"
 
 
-def note_file(path: Path) -> None:
+def check_note(path: Path) -> None:
     if read_note(path.parent) is None:
         raise DataError("expected the hash and the folder of the prepared photos")
 
 
-def sums_file(expected: list[str], path: Path) -> str:
+def check_sums(expected: list[str], path: Path) -> str:
     sums = read_json(path)
     if not isinstance(sums, dict) or not all(isinstance(value, str) for value in sums.values()):
         raise DataError("expected the SHA-256 of each file")
@@ -92,7 +92,7 @@ def sums_file(expected: list[str], path: Path) -> str:
     return f"of {len(sums)} files"
 
 
-def output(expected: str | None, path: Path) -> str:
+def check_output(expected: str | None, path: Path) -> str:
     """Check an output file, and return its description.
 
     Raises DataError if its checksum differs, and the errors of its reader.
@@ -111,7 +111,7 @@ def output(expected: str | None, path: Path) -> str:
     return ""
 
 
-NO_SUMS = "is missing, as always with a Trainer; without it, outputs cannot be verified"
+NO_SUMS = "is missing, as in every run of a Trainer; without it, outputs cannot be verified"
 
 
 def verify(state: RunState) -> dict[str, Any]:
@@ -148,8 +148,8 @@ def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool =
     has_ended = CHECKSUMS in names and (PIPELINE in sums or not sums)  # while a run continues, it lists other files
     is_done = expect_all or state.phase is Phase.DONE or (not status and has_ended)
     check_one = partial(check_file, out)
-    yield check_one(PIPELINE, partial(settings_file, state, settings))
-    yield check_one(STATUS, status_file)
+    yield check_one(PIPELINE, partial(check_settings, state, settings))
+    yield check_one(STATUS, check_status)
     if "matrix" in settings or "cells" in status:
         cells |= _find_cells(out, is_done)
         for name, cell in sorted(cells.items()):
@@ -160,21 +160,21 @@ def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool =
     checkpoints = [*(path.name for path in state.checkpoints), str(status.get("checkpoint") or "")]
     checkpoints += sorted(path.name for path in (out / CHECKPOINTS).glob("failed_*.npz"))
     for name in filter(is_inside, dict.fromkeys(checkpoints)):
-        yield check_one(f"{CHECKPOINTS}/{name}", checkpoint_file)
+        yield check_one(f"{CHECKPOINTS}/{name}", check_checkpoint)
     files = [RECORDS, METRICS] if is_done else []
     with suppress(ConfigError):  # reported for its own file
         files += declared_outputs(state.pipeline) if is_done else []
     if CHECKSUMS in names:
-        yield check_one(CHECKSUMS, partial(sums_file, [PIPELINE, *files] if is_done else []))
+        yield check_one(CHECKSUMS, partial(check_sums, [PIPELINE, *files] if is_done else []))
     elif is_done:
         yield {"file": CHECKSUMS, "whole": False, "detail": NO_SUMS}
     if is_done or INPUTS in names:
         yield check_one(INPUTS, lambda path: Identity.from_data(read_json(path)))
     if (is_done and settings.get("prepare")) or PREPARE_SUMMARY in names:
-        yield check_one(PREPARE_SUMMARY, note_file)
+        yield check_one(PREPARE_SUMMARY, check_note)
     for name in dict.fromkeys([*sums, *files, *sorted({METRICS, RECORDS} & names)]):
         if name != PIPELINE:
-            yield check_one(name, partial(output, sums.get(name)))
+            yield check_one(name, partial(check_output, sums.get(name)))
 
 
 def check_file(out: Path, name: str, check: Callable[[Path], Any]) -> dict[str, Any]:
@@ -230,10 +230,10 @@ def _remedy(state: RunState, verified: dict[str, Any]) -> str:
         return f"run its `clsplat run … --out {shell_quote(state.out)}` again, with {option}"
     if can_continue:
         return f"`clsplat resume {shell_quote(state.out)}` repeats the stages after its newest checkpoint"
-    return f"start over: {state.restart}"
+    return f"start over: {state.restart_command}"
 
 
-def lines(result: dict[str, Any]) -> str:
+def format_files(result: dict[str, Any]) -> str:
     """Format the result of `verify` as text, one line per file."""
     rows = (
         (f"{'ok     ' if entry['whole'] else 'DAMAGED'}  {entry['file']}", entry["detail"])
@@ -248,8 +248,8 @@ def lines(result: dict[str, Any]) -> str:
 def check(pipeline: str) -> dict[str, Any]:
     """Check a pipeline, matrix, run folder, model, or field, given by its path, or a shipped pipeline, by its name.
 
-    Returns the path and name of a pipeline or matrix, with its stages and the keys that depend on the photos, or its
-    cells; the result of `verify` for a run folder, and of `examine` for a model; the number of parameters of a field.
+    Returns the path, the name, the stages, and the undecided keys of a pipeline; the path, the name, and the cells of a
+    matrix; the result of `verify` for a run folder or of `examine` for a model; or the number of parameters of a field.
     Raises ConfigError, and DataError for a folder without a run.
     """
     if is_field(Path(pipeline)) and path_exists(Path(pipeline)):

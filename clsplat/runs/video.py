@@ -23,7 +23,7 @@ from clsplat.opencl.device import Device
 from clsplat.photos.photographs import BACKGROUNDS
 from clsplat.pipeline.loading import load as load_pipeline
 from clsplat.runs.model_file import (
-    KINDS,
+    FORMATS,
     AnyModel,
     ModelSource,
     content_points,
@@ -33,7 +33,7 @@ from clsplat.runs.model_file import (
     read,
     require_model,
     trained_file,
-    write_pictures,
+    write_renders,
 )
 from clsplat.runs.state import has_pipeline
 from clsplat.scene.photographs import load_photograph
@@ -56,7 +56,7 @@ class VideoTarget:
 
     video: Path | None  # the video file; None: write images
     out: Path = Path("renders")  # folder of the images
-    kind: str = "png"  # file format of the images, one of KINDS
+    kind: str = "png"  # file format of the images, one of FORMATS
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,9 @@ def make_video(
     """
     start_time = time.perf_counter()
     videos = layer_files(target.video, extras.layers) if target.video else {}
-    if target.kind not in KINDS:
-        raise ConfigError(f"--format: expected {' or '.join(KINDS)}, got '{target.kind}'")
-    if videos and target.kind != KINDS[0]:
+    if target.kind not in FORMATS:
+        raise ConfigError(f"--format: expected {' or '.join(FORMATS)}, got '{target.kind}'")
+    if videos and target.kind != FORMATS[0]:
         raise ConfigError(f"--format {target.kind} is for images, and a video has 8 bits; omit --video")
     if extras.side and not videos:
         raise ConfigError("--side needs --video, because images are written without a comparison; add --video FILE")
@@ -100,7 +100,7 @@ def make_video(
     canvas = Canvas(make_painter(content, opened_device, background))
     if not videos:
         photo_files = [view.image_path for view in used_scene.views] if used_scene else []
-        files = write_pictures(canvas, plan.views, target.out, target.kind, extras.layers, photo_files, is_video=True)
+        files = write_renders(canvas, plan.views, target.out, target.kind, extras.layers, photo_files, is_video=True)
     else:
         side = _make_side(extras.side, plan, used_scene, background, opened_device, origin)
         render_video(canvas, plan, videos, side, lambda views: counted(views, "frames rendered", len(views)))
@@ -202,7 +202,7 @@ def view(
     if photographs == "all" and source is None:
         raise ConfigError("--photographs all needs the photos of a scene; add --scene, or use a run folder")
     _warn_about_different_scenes(models, source)
-    by_name = dict(zip(names(models), map(load, counted(models, "models read", len(models))), strict=True))
+    by_name = dict(zip(model_names(models), map(load, counted(models, "models read", len(models))), strict=True))
     _warn_about_size(by_name, splats)
     first_model = next(iter(by_name.values()))
     used_scene = source.scene(first_model).downscaled(source.settings.downscale) if source else None
@@ -243,7 +243,7 @@ def _warn_about_size(models_by_name: Mapping[str, Model], splats: int | None) ->
 def _warn_about_different_scenes(models: Sequence[Path], source: ModelSource | None) -> None:
     """Warn if the models are of different scenes, because the page has the cameras of only one scene."""
     scenes = {}
-    for name, run in zip(names(models), map(find_run, models), strict=True):
+    for name, run in zip(model_names(models), map(find_run, models), strict=True):
         with suppress(ConfigError):  # of a missing plug-in; the model can be shown without it
             if run and (path := load_pipeline(str(run / PIPELINE)).settings.scene.path):
                 scenes[name] = Path(path).resolve()
@@ -252,7 +252,7 @@ def _warn_about_different_scenes(models: Sequence[Path], source: ModelSource | N
         LOG.warning("%s shows %s, %s shows %s; the page has the cameras of %s", *names_and_scenes, source.scene_name)
 
 
-def names(models: Sequence[Path]) -> list[str]:
+def model_names(models: Sequence[Path]) -> list[str]:
     """Return a unique name for each model: its folder or file name, with the parent folder if names repeat."""
     names = [path.resolve().name if path.is_dir() else path.stem for path in models]
     folders = [path.resolve().parent.name for path in models]

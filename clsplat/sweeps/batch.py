@@ -94,8 +94,8 @@ class Batch:
     def ready(self) -> None:
         """Prepare for the first cell.  This is called once, before that cell starts."""
 
-    def on_change(self, started: str | None) -> None:
-        """Handle the start or the end of a cell.  started: name of the started cell, or None if a cell ended."""
+    def on_change(self, started_cell: str | None) -> None:
+        """Handle the start or the end of a cell.  started_cell: its name, or None if a cell ended."""
 
     def require_lock(self) -> None:
         """Raise OutputError if another process has taken over the folder."""
@@ -317,11 +317,11 @@ class _Sweep(Batch):
         self.status.enter("running")
         self.on_change(None)
 
-    def on_change(self, started: str | None) -> None:
-        if started is not None:
-            self.status.note(stage=started)
+    def on_change(self, started_cell: str | None) -> None:
+        if started_cell is not None:
+            self.status.note(stage=started_cell)
             return
-        self.status.note(done=len({*self.outcomes, *self.failures}), failed=self.failures.texts())
+        self.status.note(done=len({*self.outcomes, *self.failures}), failed=self.failures.messages())
         self.status.refresh()
 
     def require_lock(self) -> None:

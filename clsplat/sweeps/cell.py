@@ -71,11 +71,11 @@ def _digest(parts: Iterable[str]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:HASH_DIGITS]
 
 
-def identify(settings: SceneSettings, digest_of: Callable[[Path], str]) -> tuple[Scene, Identity]:
-    """Read a scene, hash its files with `digest_of`, and return both; photos are not decoded.  Raises DataError."""
+def identify(settings: SceneSettings, hash_file: Callable[[Path], str]) -> tuple[Scene, Identity]:
+    """Read a scene and hash its files with `hash_file`; photos are not decoded.  Raises DataError."""
     scene, _ = settings.apply(read_scene(settings.folder, settings.split))
     paths = dict.fromkeys(path for view in scene.views for path in (view.image_path, view.mask_path))
-    files = {path: ImageFile(digest=digest_of(path)) for path in paths if path is not None and path != NO_FILE}
+    files = {path: ImageFile(digest=hash_file(path)) for path in paths if path is not None and path != NO_FILE}
     return scene, Identity.from_scene(scene, files)
 
 
@@ -116,12 +116,12 @@ def _hash_file(path: Path) -> str:
     return ""
 
 
-KEY = 20  # number of hexadecimal digits of a cell's key
+KEY_DIGITS = 20  # number of hexadecimal digits of a cell's key
 
 
 def is_key(value: Any) -> bool:
     """Return whether a value, for example from an untrusted store, has the format of a cell's key."""
-    return isinstance(value, str) and re.fullmatch(f"[0-9a-f]{{{KEY}}}", value) is not None
+    return isinstance(value, str) and re.fullmatch(f"[0-9a-f]{{{KEY_DIGITS}}}", value) is not None
 
 
 @dataclass(frozen=True)
@@ -167,4 +167,4 @@ class CellRun:
     @property
     def key(self) -> str:
         """The name of the cell's folder in a store."""
-        return hashlib.sha256(json.dumps(self.spec, sort_keys=True).encode()).hexdigest()[:KEY]
+        return hashlib.sha256(json.dumps(self.spec, sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]

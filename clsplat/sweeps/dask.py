@@ -85,7 +85,7 @@ def security(tls: Tls | None) -> Any:
     return distributed.Security(tls_ca_file=tls.ca, require_encryption=True, **sides)
 
 
-def warn_of_open_port(execution: Execution) -> None:
+def warn_about_open_port(execution: Execution) -> None:
     """Warn if a remote scheduler is used without TLS."""
     if execution.insecure:
         LOG.warning("%s: not encrypted; anyone who can reach the scheduler's port can run code", execution.engine)
@@ -134,7 +134,7 @@ def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "C
             silence_logs=logging.CRITICAL,
         )
         return Cluster(distributed.Client(cluster, set_as_default=False), store, cluster, slots)
-    warn_of_open_port(execution)
+    warn_about_open_port(execution)
     try:
         client = distributed.Client(
             execution.address, security=security(execution.tls), set_as_default=False, timeout=CONNECT_TIMEOUT_S
@@ -265,7 +265,7 @@ class Cluster:
 # Worker processes of this machine, one per device, for a remote scheduler.
 
 
-def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
+def offer_devices(execution: Execution, devices: Sequence[str] | None = None) -> None:
     """Test each device with a short run, and run cells of a scheduler until it exits or a signal arrives.
 
     This is `clsplat worker`.  execution: has the address of the scheduler.  devices: names of devices; default: all
@@ -276,7 +276,7 @@ def offer(execution: Execution, devices: Sequence[str] | None = None) -> None:
     slots = find_slots(Owner.current().host, list(devices) if devices is not None else None)
     for slot in slots:
         LOG.info("offering %s, bits class %s", slot.text, slot.bits)
-    warn_of_open_port(execution)
+    warn_about_open_port(execution)
     stop = threading.Event()
     with dask.config.set(SETTINGS), stopping_on_signals(stop.set):
         asyncio.run(_serve(execution, slots, stop))

@@ -75,7 +75,7 @@ class PendingCell:
 
     cell: CellRun  # without a bits class
     cost: float  # steps times pixels; determines the order of cells
-    too_small: int = 0  # memory of the largest device whose memory was insufficient, bytes
+    failed_memory: int = 0  # memory of the largest device on which the cell ran out of memory, bytes
 
     def in_class(self, bits: str) -> CellRun:
         """Return a copy of the cell for devices of a bits class."""
@@ -165,14 +165,14 @@ class Dispatcher:
         The device must be in the cell's bits class.  If possible, it has more memory than devices on which the cell
         ran out of memory.
         """
-        allowed = self._allowed_slots(pending, slots)
-        return slot in ([candidate for candidate in allowed if candidate.memory > pending.too_small] or allowed)
+        allowed_slots = self._allowed_slots(pending, slots)
+        return slot in ([item for item in allowed_slots if item.memory > pending.failed_memory] or allowed_slots)
 
     def _allowed_slots(self, pending: PendingCell, slots: Sequence[DeviceSlot]) -> list[DeviceSlot]:
         """Return the devices on which a cell may run.  A started cell stays in its class if possible."""
         if self.is_same:
             return [slot for slot in slots if slot.bits == self.bits]
-        classes = {slot.bits for slot in slots if not pending.too_small}
+        classes = {slot.bits for slot in slots if not pending.failed_memory}
         started_classes = [bits for bits in classes if self.store.folder(pending.in_class(bits).key).path.is_dir()]
         return [slot for slot in slots if not started_classes or slot.bits in started_classes]
 
@@ -188,7 +188,7 @@ class Dispatcher:
             return
         if outcome.state == "different":
             raise BitsMismatch(outcome.message)
-        retry = replace(pending, too_small=slot.memory)
+        retry = replace(pending, failed_memory=slot.memory)
         if outcome.exit_code == MemoryLimitError.exit_code and any(
             candidate.memory > slot.memory for candidate in self._allowed_slots(retry, self.engine.slots())
         ):

@@ -33,7 +33,7 @@ from clsplat.runs.failures import Failures, recording_failures
 from clsplat.runs.live.live import Live
 from clsplat.runs.model_file import with_scene_path
 from clsplat.runs.opening import read_run_scene, resolve_choices
-from clsplat.runs.run_folder import Start, choose_start, free_folder
+from clsplat.runs.run_folder import Start, choose_start, find_free_folder
 from clsplat.runs.runner import require_same_inputs
 from clsplat.runs.state import Phase, RunState
 from clsplat.runs.status import summary
@@ -136,8 +136,8 @@ class Job:
         start: Start,
         execution: dict[str, Any] | None,
     ) -> "Job":
-        edits = with_scene_path(overrides, scene)
-        experiment = load_experiment(pipeline, edits, execution)
+        overrides = with_scene_path(overrides, scene)
+        experiment = load_experiment(pipeline, overrides, execution)
         if experiment is None and execution is not None:
             raise ConfigError(f"{pipeline}: is a single run; --on is for a file with `matrix:`")
         if experiment and state and start == "resume" and execution is None and state.phase is not Phase.DONE:
@@ -147,11 +147,11 @@ class Job:
                     f"{state.out}: was started with --on; its cells are in {shorten(str(previous))}; pass --on again"
                 )
         if state:
-            return cls(experiment or load(pipeline, edits), state, start)
+            return cls(experiment or load(pipeline, overrides), state, start)
         if experiment:
-            return cls(experiment, free_folder(Path("runs") / experiment.name, None, start), start)
-        single = load(pipeline, edits)
-        return cls(single, free_folder(Path("runs") / single.settings.name, single, start), start)
+            return cls(experiment, find_free_folder(Path("runs") / experiment.name, None, start), start)
+        single = load(pipeline, overrides)
+        return cls(single, find_free_folder(Path("runs") / single.settings.name, single, start), start)
 
     @classmethod
     def resume(
@@ -231,7 +231,7 @@ def live_preview(port: int | None) -> Iterator[Live | None]:
         yield None
         return
     with Live(port) as live:
-        terminal.print_message(live.text)  # the address is secret, and others may read the log
+        terminal.print_message(live.message)  # the address is secret, and others may read the log
         yield live
 
 
@@ -258,7 +258,7 @@ def run_matrix(
                         run_pipeline(cell.pipeline, states[cell.name], device, start, live)
             except Interrupted as error:
                 raise Interrupted(f"stopped in {title}; `clsplat resume {shell_quote(out)}` continues it") from error
-            status.note(done=number, failed=failures.texts())
+            status.note(done=number, failed=failures.messages())
             status.refresh()
 
 

@@ -103,9 +103,8 @@ def link_or_copy(source: Path, target: Path) -> None:
 # An attempt at a cell: a run folder with a lease, and a manifest once the run is done.
 
 LEASE, MANIFEST, PIPELINE_FILE, ERRORS = "lease.json", "manifest.json", "cell.yaml", "errors.txt"
-ATTEMPT_FILES = frozenset(
-    {LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, PREPARE_SUMMARY}
-)  # not copied to other attempts; PREPARE_SUMMARY has a path
+# files that are not copied to other attempts; PREPARE_SUMMARY contains a path
+ATTEMPT_FILES = frozenset({LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, PREPARE_SUMMARY})
 MEASURED = ("psnr", "ssim", "views")  # values of metrics.json that depend only on bits, not on time
 BEAT = 10.0  # seconds between two heartbeats of a lease
 Rank = tuple[bool, int]  # order of checkpoints: whether it belongs to a refit, and its step
@@ -396,7 +395,7 @@ class CellFolder:
             return values if isinstance(values, dict) else None
         return None
 
-    def collect(self, now: float) -> None:
+    def clean_up(self, now: float) -> None:
         """Remove the attempts of a published cell that had no heartbeat for STALE_AFTER_S seconds.
 
         now: the current time by the clock of the store.  Other attempts remain, because their processes may be running.

@@ -73,7 +73,7 @@ def _run_cell(
     while True:
         if manifest := folder.verified_manifest():
             store.log_event("skip", cell=cell.key, worker=options.worker)
-            folder.collect(store.now())
+            folder.clean_up(store.now())
             return Outcome("published", str(manifest["bits"]))
         if should_stop():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped")
@@ -145,7 +145,7 @@ def _publish(store: Store, folder: CellFolder, attempt: CellAttempt) -> Outcome:
     store.log_event(
         "publish" if is_first else "second", cell=folder.key, attempt=attempt.path.name, bits=manifest["bits"]
     )
-    folder.collect(store.now())
+    folder.clean_up(store.now())
     return Outcome("published", str(manifest["bits"]))
 
 

@@ -101,7 +101,7 @@ def _check_files(out: Path, is_done: bool) -> Iterator[dict[str, Any]]:
 
     parts = _run_names(out)
     readers: dict[str, Callable[[Path], str]] = {MANIFEST: describe_manifest}
-    readers |= {f"{name}.ply": partial(verify.output, None) for name in parts if name != COARSE}
+    readers |= {f"{name}.ply": partial(verify.check_output, None) for name in parts if name != COARSE}
     for name, read in readers.items():
         if is_done or (out / name).exists():
             yield verify.check_file(out, name, read)

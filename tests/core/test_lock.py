@@ -21,7 +21,7 @@ from clsplat.core.errors import OutputError
 from clsplat.core.files import LOCK
 from clsplat.core.machine import Owner
 from clsplat.runs import run_folder
-from clsplat.runs.run_folder import free_folder
+from clsplat.runs.run_folder import find_free_folder
 from clsplat.runs.state import RunState
 from clsplat.training import status as writing
 from tests.support.commands import clsplat as command
@@ -194,21 +194,21 @@ def test_trainers_hold_their_folder_until_they_end(tiny_scene, tmp_path):
 
 
 def test_run_just_starting_in_the_default_folder_is_not_joined(tmp_path):
-    assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
+    assert find_free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
     (tmp_path / "splat").mkdir()
     with lock.lock_folder(tmp_path / "splat"):
-        assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat-2"
-    assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
+        assert find_free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat-2"
+    assert find_free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
 
 
 def test_killed_start_does_not_change_the_default_folder(tmp_path):
     (tmp_path / "splat").mkdir()
     process = holder(tmp_path / "splat")
-    assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat-2"
+    assert find_free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat-2"
     process.kill()
     process.wait()
     assert (tmp_path / "splat" / LOCK).exists()
-    assert free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
+    assert find_free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
 
 
 def test_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):

@@ -247,7 +247,7 @@ def test_failed_mapping_is_described_by_groups(tmp_path):
     joined = replace(result, pairs={**result.pairs, ("a", "pair"): 30})
     assert diagnose(joined).startswith("take more sharp photos"), "seven of twelve belong together"
     weak = replace(result, pairs={("a", "b"): 20, ("b", "c"): 29})
-    assert diagnose(weak).startswith("no two of them overlap enough: 29 matches at most; take")
+    assert diagnose(weak).startswith("no two of them overlap enough: at most 29 features match; take")
     two = MatchGraph(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
     assert "the largest with 2 (a, b), and 1 without a good match (c); take" in diagnose(two)
 

@@ -47,7 +47,7 @@ def test_few_photographs_get_advice(tmp_path):
     for i in range(3):
         photograph(tmp_path / f"{i}.png")
     inspection = Inspection.from_folder(tmp_path)
-    assert finding_text(inspection, "warning").startswith("there are only 3 photos, from which cameras are often")
+    assert finding_text(inspection, "warning").startswith("there are only 3 photos, often too few to find the cameras")
     assert inspection.verdict.startswith("cameras are not known yet, and there are only 3 photos")
     for i in (1, 2):
         (tmp_path / f"{i}.png").unlink()

@@ -62,7 +62,7 @@ def live():
 
 
 def test_live_page_does_not_change_the_bits(live, few_steps, tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "FAREWELL", 30.0)  # it ends as soon as the page has heard
+    monkeypatch.setattr(module, "END_TIMEOUT", 30.0)  # it ends as soon as the page has heard
     client, seen = Client(live), {}
 
     def look():
@@ -108,7 +108,7 @@ def test_title_names_the_given_folder(live, tiny_scene, tmp_path, monkeypatch):
     shutil.copytree(tiny_scene, prepared)
     monkeypatch.setattr("clsplat.runs.opening.read_scene", lambda folder, holdout: read_scene(prepared, holdout))
     trained(live, tiny_scene, tmp_path / "run")
-    assert live.state.shown.title == f"smoke · {tiny_scene.name}"
+    assert live.state.run.title == f"smoke · {tiny_scene.name}"
 
 
 def test_nothing_is_drawn_without_viewers(live, tiny_scene, tmp_path, monkeypatch):
@@ -120,7 +120,7 @@ def test_pause_ends_by_itself_when_no_page_is_open(live, tiny_scene, tmp_path, m
     monkeypatch.setattr(module, "PAUSE_TIMEOUT", 0.3)
     live.state.set_paused(True)
     trained(live, tiny_scene, tmp_path / "run")
-    assert not live.state.paused
+    assert not live.state.is_paused
 
 
 def test_signal_ends_a_pause_and_saves_the_state(live, tiny_scene, tmp_path):

@@ -118,7 +118,7 @@ def test_used_port_is_one_sentence_or_the_next_one_is_taken(server):
 def test_answers_are_paced(server):
     server._rate.spend(module.BURST + 3)
     waited = threading.Event()
-    threading.Thread(target=lambda: (server.pace(), waited.set()), daemon=True).start()
+    threading.Thread(target=lambda: (server.throttle(), waited.set()), daemon=True).start()
     assert not waited.wait(0.05)
     assert waited.wait(5)
 

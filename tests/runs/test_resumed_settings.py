@@ -93,7 +93,7 @@ def test_run_stopped_after_its_last_stage_finishes(killed_run, tiny_scene, few_s
 def test_longer_training_reports_what_a_longer_plan_changes(few_steps, tiny_scene, tmp_path, caplog):
     """An edit that is due at the last step of a run skips no update, as it does between steps."""
     Job.resume(few_steps, steps=14)
-    assert "'densify' was due at step 12, the last one, so the result differs from a run planned as long" in caplog.text
+    assert "'densify' was due at step 12, the last one, so the result differs from a single longer run" in caplog.text
     out = tmp_path / "run"
     train(tiny_scene, out, *FEW, "densify.stop=12")
     caplog.clear()

@@ -24,8 +24,8 @@ def test_steps_follow_from_a_rehearsal():
     assert rehearsal.steps_in(25.0) == 1000
     assert rehearsal.steps_in(4.0) == 0
     assert replace(rehearsal, trend=0.5).steps_in(5 + 600 * 0.02 * 3**0.5) == pytest.approx(600, abs=1)
-    assert rehearsal.later(0.2) == (2, 3)
-    assert rehearsal.later(0.99) == (1, 1)
+    assert rehearsal.later_step_times(0.2) == (2, 3)
+    assert rehearsal.later_step_times(0.99) == (1, 1)
 
 
 @pytest.mark.parametrize("minutes", [2.0, 10.0, 60.0])
@@ -152,7 +152,7 @@ def test_too_long_rehearsal_is_shortened(tiny_scene, tmp_path, monkeypatch, few)
 @pytest.mark.slow
 def test_too_few_minutes_are_refused_in_the_rehearsal(tiny_scene, tmp_path, few_steps):
     """A run that is done stays so, and a new one leaves nothing."""
-    told = r"--minutes 1e-06: too short: this scene needs at least 200 steps on this device; use more minutes"
+    told = r"--minutes 1e-06: too short: at least 200 steps must fit on this device; use more minutes"
     with pytest.raises(ConfigError, match=told):
         clsplat.run("smoke", tiny_scene, tmp_path / "new", minutes=1e-6)
     assert not list(tmp_path.iterdir())
@@ -164,8 +164,8 @@ def test_too_few_minutes_are_refused_in_the_rehearsal(tiny_scene, tmp_path, few_
 
 
 def test_training_keeps_enough_steps_to_separate_edits():
-    assert time_budget.min_steps_of(load("splat")) == 300
-    assert time_budget.min_steps_of(load("mip_nerf")) == 20
+    assert time_budget.min_training_steps(load("splat")) == 300
+    assert time_budget.min_training_steps(load("mip_nerf")) == 20
 
 
 def test_impossible_time_budget_is_refused(tiny_scene, tmp_path, few_steps):

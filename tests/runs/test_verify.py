@@ -211,7 +211,7 @@ def test_every_missing_file_is_named(finished, copy):
 def test_run_without_checksums_is_not_reported_as_complete(copy):
     (copy / "checksums.json").unlink()
     done = command("check", copy, expect=7)
-    assert "checksums.json is missing, as always with a Trainer" in done.stderr
+    assert "checksums.json is missing, as in every run of a Trainer" in done.stderr
     assert "whole" not in done.stderr
 
 

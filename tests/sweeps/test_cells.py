@@ -281,7 +281,7 @@ def test_copied_result_gets_its_manifest_last(store, options, tmp_path, monkeypa
 def test_attempts_are_removed_only_by_lease_age(store, options):
     folder = store.add(CELL)
     old, young = folder.begin("a", options.since), folder.begin("b", options.since)
-    folder.collect(store.now() + 1e6)
+    folder.clean_up(store.now() + 1e6)
     assert old.path.is_dir(), "nothing is published"
     os.utime(old.path / LEASE, (store.now() - 601, store.now() - 601))
     run_cell(CELL, store, command(WRITES), options)

@@ -100,7 +100,7 @@ def test_costs_are_shown_if_recorded(make_run, tmp_path):
     assert "<td>57</td>" in page
     assert "test PSNR over CPU seconds of training, dB" in page
     run = RunFolder.read(new)
-    assert run.over_cpu_seconds(run.points("evaluate", "psnr")) == [(6.0, 50.0), (10.0, 70.0)], "between two reports"
+    assert run.over_cpu_seconds(run.curve("evaluate", "psnr")) == [(6.0, 50.0), (10.0, 70.0)], "between two reports"
     alone = page_of(tmp_path, old)
     assert "CPU seconds" not in alone
     assert "device memory" not in alone
@@ -235,7 +235,7 @@ def test_decisions_about_photos_make_no_variant(make_run):
 
 def crops_of(*folders: Path) -> list[crops.ImageCrop]:
     runs = [RunFolder.read(folder) for folder in folders]
-    return crops.find_crops(runs, *runs[0].scene.read(runs[0].photographs))
+    return crops.find_crops(runs, *runs[0].scene.read(runs[0].photo_folder))
 
 
 def test_crops_show_where_runs_differ(make_run, monkeypatch):
@@ -262,13 +262,13 @@ def test_single_run_is_compared_with_the_photograph(make_run):
 def test_renders_outside_the_run_folder_are_refused(make_run, folder):
     run = RunFolder.read(make_run("alone"))
     with pytest.raises(DataError, match=r"render\.folder is outside the run folder"):
-        _ = replace(run, settings={"stages": [{"render": {"folder": folder}}]}).renders
+        _ = replace(run, settings={"stages": [{"render": {"folder": folder}}]}).render_folder
 
 
 def test_renders_of_a_bent_lens_are_pinhole_images(make_run):
     folder = make_run("bent", error=0)
     run = RunFolder.read(folder)
-    scene, background = run.scene.read(run.photographs)
+    scene, background = run.scene.read(run.photo_folder)
     views = []
     for view in scene.views:
         taken = load_image(view, WHITE).shape

@@ -34,7 +34,7 @@ def inspection_page(inspection: Inspection) -> str:
         state="ready" if worst == "note" else worst,
         verdict=inspection.verdict[0].upper() + inspection.verdict[1:],
         findings=inspection.findings,
-        figures=summarize(inspection.facts),
+        facts=summarize(inspection.facts),
         cameras=_draw_cameras(inspection),
         far=pluralize(len(inspection.facts.outlier_cameras), "camera") if inspection.facts.outlier_cameras else "",
         points_per_view=_draw_points_per_view(inspection),

@@ -1,7 +1,7 @@
 // The requests of the page to the run: its state at intervals, and images one at a time.
 
 const STATE = 1000, HIDDEN = 10000, AGAIN = 1000, PATIENCE = 250, PUMP = 60; // ms
-const PAGE = Math.floor(Math.random() * 1e9); // the queue of the run tells two pages apart by it
+const PAGE = Math.floor(Math.random() * 1e9); // identifies the page in the queue of the run
 
 class Link {
   constructor(live) {

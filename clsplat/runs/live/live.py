@@ -11,7 +11,7 @@ import numpy as np
 from clsplat.core.errors import ClsplatError
 from clsplat.core.progress import Progress
 from clsplat.photos.photographs import BACKGROUNDS
-from clsplat.runs.live.preview import RESERVE, Curves, LiveState, Pictures, Preview, PreviewRequest, ShownRun
+from clsplat.runs.live.preview import RESERVE, Curves, EncodedPhotos, LiveRun, LiveState, Preview, PreviewRequest
 from clsplat.runs.live.server import LOOPBACK, Handlers, Server, scene_data
 from clsplat.scene.scene import format_position
 from clsplat.scene.viewpoint import Viewpoint
@@ -21,8 +21,8 @@ from clsplat.training.status import StatusFile
 LOG = logging.getLogger("clsplat")
 OPEN_TIMEOUT = 5.0  # s without a request until a page counts as closed, and the memory of previews is freed
 PAUSE_TIMEOUT = 120.0  # s without a request until a pause ends; background tabs send one request per minute
-FAREWELL = 1.5  # s that a finished run waits for the page to receive the end of the run
-TOKEN = 16  # number of random bytes
+END_TIMEOUT = 1.5  # s that a finished run waits for the page to receive the end of the run
+TOKEN_BYTES = 16  # number of random bytes
 
 
 class Live:
@@ -32,7 +32,7 @@ class Live:
         """port: of the loopback address, or 0 for the first free default port.  Raises ConfigError if it is in use."""
         self.state = LiveState()
         self._preview: Preview | None = None
-        self._server = Server(port, secrets.token_urlsafe(TOKEN), Handlers(self.state))
+        self._server = Server(port, secrets.token_urlsafe(TOKEN_BYTES), Handlers(self.state))
 
     def __enter__(self) -> "Live":
         return self
@@ -45,7 +45,7 @@ class Live:
         return f"http://{LOOPBACK}:{self._server.port}/{self._server.token}/"
 
     @property
-    def text(self) -> str:
+    def message(self) -> str:
         """A message with the address of the page, and the command for access from another machine."""
         port = self._server.port
         return (
@@ -57,9 +57,9 @@ class Live:
         """Stop the server.  If a page is open, wait for a moment until it has received the end of the run."""
         state = self.state
         state.set_paused(False)
-        state.ended = True
+        state.has_ended = True
         try:
-            deadline = time.monotonic() + FAREWELL
+            deadline = time.monotonic() + END_TIMEOUT
             while state.idle_seconds() < OPEN_TIMEOUT and not state.is_end_sent and time.monotonic() < deadline:
                 self._release()  # a page that waits for a preview makes no other request
                 time.sleep(0.05)
@@ -86,14 +86,14 @@ class Live:
 
         def show_both(progress: Progress) -> None:
             show(progress)
-            if run := self.state.shown:
+            if run := self.state.run:
                 run.curves.add(progress)
 
         return show_both
 
     def _attach(self, run: Run) -> None:
         state, scene = self.state, run.scene.downscaled(run.downscale)
-        run_number = state.shown.number + 1 if state.shown else 1
+        run_number = state.run.number + 1 if state.run else 1
         title, test_views = f"{run.name} · {run.scene_name}", scene.split("test")
         if scene.origin.any():
             title += f" · origin {format_position(scene.origin)}"
@@ -102,9 +102,9 @@ class Live:
         page_data = scene_data(run_number, title, scene.views, {view.name for view in test_views}, viewpoint)
         photographs = run.photographs
         background = BACKGROUNDS[photographs.background_name]
-        pictures = Pictures(scene.views, background, photographs.undistorted, state.budget)
+        photos = EncodedPhotos(scene.views, background, photographs.undistorted, state.budget)
         state.step, state.error = 0, ""
-        state.shown = ShownRun(run_number, title, scene.views, page_data, pictures, Curves([]))
+        state.run = LiveRun(run_number, title, scene.views, page_data, photos, Curves([]))
         self._preview = Preview(run)
         run.on_step = lambda: self._on_step(run)
         state.budget.skip()
@@ -125,7 +125,7 @@ class Live:
             self._draw(run, preview)
         elif state.idle_seconds() > OPEN_TIMEOUT:
             preview.release()
-        if state.paused and not run.interrupted:
+        if state.is_paused and not run.interrupted:
             self._pause(run, preview)
 
     def _draw(self, run: Run, preview: Preview, is_paused: bool = False) -> None:
@@ -159,7 +159,7 @@ class Live:
         state = self.state
         LOG.info("paused at step %d from the live page", run.step)
         with run.status.stage("paused"):
-            while state.paused and not run.interrupted:
+            while state.is_paused and not run.interrupted:
                 if state.idle_seconds() > PAUSE_TIMEOUT:
                     LOG.info("no live page connected for %.0f s; resuming training", PAUSE_TIMEOUT)
                     state.set_paused(False)

@@ -110,7 +110,7 @@ class RequestQueue:
 LOG = logging.getLogger("clsplat")
 SIDES = (400, 280, 200, 140)  # px, the longer side
 TARGET_TIMES: dict[Pace, float] = {"moving": 0.04, "still": 0.4, "again": 0.4}  # s per preview; determines its size
-GUESS = 0.03  # s per preview, before the first measurement
+INITIAL_COST = 0.03  # s per preview, before the first measurement
 QUALITY = 85  # of the JPEG
 MAX_PAIRS = 1 << 23  # pairs in memory at a time, about 100 MB; frames with more pairs are rendered in bands
 MAX_MEMORY = 0.95  # fraction of the device's memory that may be used
@@ -166,7 +166,7 @@ class Preview:
         """
         if side in self._costs:
             return self._costs[side]
-        return max((cost * min(1.0, (side / size) ** 2) for size, cost in self._costs.items()), default=GUESS)
+        return max((cost * min(1.0, (side / size) ** 2) for size, cost in self._costs.items()), default=INITIAL_COST)
 
 
 def downscaled_view(view: View, side: int) -> View:
@@ -220,7 +220,7 @@ JPEG_QUALITY = 88
 PHOTO_TIMEOUT = 20.0  # s that a request for a photo waits
 
 
-class Pictures:
+class EncodedPhotos:
     """Encodes photos as JPEG, one at a time.  The CPU time is subtracted from the budget of the previews."""
 
     def __init__(
@@ -294,14 +294,14 @@ RESERVE = 0.3  # s of credit that repeated previews of still cameras must leave
 
 
 @dataclass(frozen=True)
-class ShownRun:
+class LiveRun:
     """The run that the pages show.  The runs of a matrix have consecutive numbers."""
 
     number: int
     title: str
     views: tuple[View, ...]
     scene: dict[str, Any]  # data for live.js
-    pictures: Pictures
+    photos: EncodedPhotos
     curves: Curves
 
 
@@ -312,12 +312,12 @@ class LiveState:
     requests: RequestQueue = field(default_factory=RequestQueue)
     budget: Credit = field(default_factory=lambda: Credit(RATE, MAX_CREDIT))
     status: StatusFile | None = None
-    shown: ShownRun | None = None
+    run: LiveRun | None = None
     step: int = 0  # training step of the model that can be rendered; 0 if there is none
-    paused: bool = False
-    ended: bool = False
+    is_paused: bool = False
+    has_ended: bool = False
     is_end_sent: bool = False  # whether a page has received the end of the run
-    error: str = ""  # why there are no previews
+    error: str = ""  # reason why there are no previews
     last_request: float = float("-inf")  # s, monotonic clock
 
     def note_request(self) -> None:
@@ -330,5 +330,5 @@ class LiveState:
 
     def set_paused(self, is_paused: bool) -> None:
         """Pause or resume the training."""
-        self.paused = is_paused
+        self.is_paused = is_paused
         self.requests.wake()

@@ -21,7 +21,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.page import inline, render
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.formats.splats import EXPECTED_TIME, is_timestamp
-from clsplat.runs.live.preview import Credit, Kind, LiveState, Pace, PreviewRequest, ShownRun
+from clsplat.runs.live.preview import Credit, Kind, LiveRun, LiveState, Pace, PreviewRequest
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
@@ -48,7 +48,7 @@ class Response:
 
     status: int
     body: bytes = b""
-    kind: str = "text/plain; charset=utf-8"
+    media_type: str = "text/plain; charset=utf-8"
     headers: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -87,7 +87,7 @@ def parse_request(target: str, host: str, token: str) -> Request:
         parts = urlsplit(target)
         query = parse_qsl(parts.query, keep_blank_values=True, max_num_fields=MAX_FIELDS)
     except ValueError:
-        raise RequestError(400, "invalid URL; expected that of this page") from None
+        raise RequestError(400, "invalid URL; expected the address of this page") from None
     secret, _, path = unquote(parts.path)[1:].partition("/")
     if not hmac.compare_digest(secret.encode("utf-8", "replace"), token.encode()):
         raise RequestError(404, "not found")
@@ -103,9 +103,9 @@ def host_name(host: str) -> str:
 LOG = logging.getLogger("clsplat")
 LOOPBACK = "127.0.0.1"
 PORT, PORTS = 8710, 20  # the first default port, and the number of ports to try
-IDLE = 15.0  # s until an idle connection is closed
+IDLE_TIMEOUT = 15.0  # s until an idle connection is closed
 RATE, BURST = 30.0, 120.0  # responses per second, and in an initial burst, because a page first loads many small images
-POLL = 0.1  # s between two checks whether the server has to stop
+POLL_INTERVAL = 0.1  # s between two checks whether the server has to stop
 
 
 class Server(socketserver.ThreadingTCPServer):
@@ -132,7 +132,7 @@ class Server(socketserver.ThreadingTCPServer):
                 f"--live: {ports} of {LOOPBACK} cannot be used ({reason}); give another port"
                 + ("" if not port else ", or none to use the first free one")
             )
-        threading.Thread(target=self.serve_forever, args=(POLL,), name="live", daemon=True).start()
+        threading.Thread(target=self.serve_forever, args=(POLL_INTERVAL,), name="live", daemon=True).start()
 
     def stop(self) -> None:
         """Stop the server; open connections are closed after their current response."""
@@ -140,7 +140,7 @@ class Server(socketserver.ThreadingTCPServer):
         self.shutdown()
         self.server_close()
 
-    def pace(self) -> None:
+    def throttle(self) -> None:
         """Wait until the rate limit allows the next response."""
         while self._rate.credit < 1:
             sleep(1 / RATE)
@@ -155,13 +155,13 @@ class _Connection(BaseHTTPRequestHandler):
 
     server: Server
     protocol_version = "HTTP/1.1"
-    timeout = IDLE
+    timeout = IDLE_TIMEOUT
     wbufsize = -1  # send a response as one packet
     disable_nagle_algorithm = True
 
     def do_GET(self) -> None:
         if not self.server.ended:
-            self.server.pace()
+            self.server.throttle()
             try:
                 response = self.server.handle(parse_request(self.path, self.headers.get("Host", ""), self.server.token))
             except RequestError as error:
@@ -175,7 +175,8 @@ class _Connection(BaseHTTPRequestHandler):
 
     def _send(self, response: Response) -> None:
         self.send_response_only(response.status)
-        headers = {"Content-Type": response.kind, "Content-Length": len(response.body), **HEADERS, **response.headers}
+        headers = {"Content-Type": response.media_type, "Content-Length": len(response.body)}
+        headers |= {**HEADERS, **response.headers}
         for name, value in headers.items():
             self.send_header(name, str(value))
         self.end_headers()
@@ -208,9 +209,9 @@ def scene_data(number: int, title: str, views: Sequence[View], test: set[str], v
 
     def view_data(index: int, view: View) -> dict[str, Any]:
         query = f"view={index}&scene={number}"
-        pictures = {kind: f"{kind}.jpg?{query}" for kind in ("thumbnail", "photograph")}
+        photos = {kind: f"{kind}.jpg?{query}" for kind in ("thumbnail", "photograph")}
         split = "test" if view.name in test else "train"
-        return {"name": view.name, "split": split, **pictures, **camera_data(view)}
+        return {"name": view.name, "split": split, **photos, **camera_data(view)}
 
     first_index = next((i for i, view in enumerate(views) if view is viewpoint.start), -1)
     entries = [view_data(i, view) for i, view in enumerate(views)]
@@ -219,7 +220,7 @@ def scene_data(number: int, title: str, views: Sequence[View], test: set[str], v
 
 # The handlers: the page, the scene, the state, images, and the two buttons.
 
-WAIT = 4.0  # s that a request waits for a preview; then the page repeats the request
+PREVIEW_TIMEOUT = 4.0  # s that a request waits for a preview; then the page repeats the request
 MAX_NUMBER = 1e9  # largest absolute value in a camera
 MAX_SIDE, MAX_ASPECT = 16384, 8.0  # of a requested preview
 STATUS_KEYS = {"state", "stage", "progress", "step", "steps", "gaussians", "seconds_left", "message", "device", "host"}
@@ -236,8 +237,8 @@ class Handlers:
             "state.json": self._state,
             "scene.json": self._scene,
             "frame.jpg": self._frame,
-            "thumbnail.jpg": lambda request: self._picture(request, "thumbnail"),
-            "photograph.jpg": lambda request: self._picture(request, "photograph"),
+            "thumbnail.jpg": lambda request: self._photo(request, "thumbnail"),
+            "photograph.jpg": lambda request: self._photo(request, "photograph"),
             "pause": lambda request: self._pause(True),
             "resume": lambda request: self._pause(False),
         }
@@ -250,11 +251,11 @@ class Handlers:
         return route(request)
 
     def _state(self, request: Request) -> Response:
-        live, run = self.live, self.live.shown
-        has_ended = live.ended  # read first, so that a page that receives the end also receives the final state
+        live, run = self.live, self.live.run
+        has_ended = live.has_ended  # read first, so that a page that receives the end also receives the final state
         status = live.status.now.model_dump(include=STATUS_KEYS, exclude_none=True) if live.status else {}
         state: dict[str, Any] = {**status, "scene": run.number if run else 0, "drawn": live.step}
-        state |= {"paused": live.paused, "ended": has_ended, "fault": live.error}
+        state |= {"paused": live.is_paused, "ended": has_ended, "fault": live.error}
         if run:
             state["points"] = run.curves.after(request.number("after", 0, 1 << 40))
         live.is_end_sent = live.is_end_sent or has_ended
@@ -279,19 +280,19 @@ class Handlers:
             if "time" in request.query:
                 view = replace(view, time=parse_timestamp(request.query["time"]))
         preview = PreviewRequest(request.number("page", 0, 1 << 40), view, cast(Pace, pace))
-        if not live.requests.wait_for(preview, WAIT):
+        if not live.requests.wait_for(preview, PREVIEW_TIMEOUT):
             raise RequestError(503, "too many preview requests")
         if preview.image is None:
             return Response(204)
         return Response(200, preview.image.jpeg, "image/jpeg", {"X-Step": str(preview.image.step)})
 
-    def _picture(self, request: Request, kind: Kind) -> Response:
+    def _photo(self, request: Request, kind: Kind) -> Response:
         run = self._require_scene()
         index = request.number("view", 0, len(run.views) - 1)
         if request.query.get("scene") != str(run.number):  # from an earlier run of a matrix
             raise RequestError(404, "not found")
         try:
-            data = run.pictures.get(kind, index)
+            data = run.photos.get(kind, index)
         except DataError as error:
             raise RequestError(404, str(error)) from None
         if data is None:
@@ -299,14 +300,14 @@ class Handlers:
         return Response(200, data, "image/jpeg", {"Cache-Control": "private, max-age=3600"})
 
     def _pause(self, is_paused: bool) -> Response:
-        if not self.live.ended:
+        if not self.live.has_ended:
             self.live.set_paused(is_paused)
-        return Response.json({"paused": self.live.paused})
+        return Response.json({"paused": self.live.is_paused})
 
-    def _require_scene(self) -> ShownRun:
-        if self.live.shown is None:
+    def _require_scene(self) -> LiveRun:
+        if self.live.run is None:
             raise RequestError(503, "no scene yet")
-        return self.live.shown
+        return self.live.run
 
 
 def parse_timestamp(text: str) -> float:

@@ -108,10 +108,10 @@ class VariantRow:
         downscale_sets: list[set[str]] = [set(getattr(run.metrics, split)) for run in self.runs]
         return set.intersection(*downscale_sets)
 
-    def figures(self, split: str, downscale: str, metric: str) -> list[float]:
+    def values(self, split: str, downscale: str, metric: str) -> list[float]:
         """Return the value of a metric for each run; empty if a run does not have it."""
         averages = [getattr(run.metrics, split).get(downscale) for run in self.runs]
-        values = [average.figure(metric) if average else None for average in averages]
+        values = [average.value(metric) if average else None for average in averages]
         available_values = [value for value in values if value is not None]
         return available_values if len(available_values) == len(values) else []
 
@@ -209,9 +209,9 @@ def _is_below(key_path: str, key: str) -> bool:
     return all(name in names for name in key.split(".") if name != "during" and not name.isdigit())
 
 
-def _name(settings: dict[str, str], distinct: Sequence[dict[str, str]]) -> str:
+def _name(settings: dict[str, str], distinct_settings: Sequence[dict[str, str]]) -> str:
     """Return the name of a variant: the name of its pipeline, and the settings in which it differs from most others."""
-    siblings = [other for other in distinct if other.get("name") == settings.get("name")]
+    siblings = [other for other in distinct_settings if other.get("name") == settings.get("name")]
     descriptions: list[str] = []
     for key_path in differing_keys(siblings):
         description, *others = (_describe_setting(key_path, variant, siblings) for variant in (settings, *siblings))
@@ -288,7 +288,7 @@ class PublishedTable(BaseModel):
         return self
 
     @property
-    def shown(self) -> dict[str, list[str]]:
+    def formatted_rows(self) -> dict[str, list[str]]:
         """The values of each method as text, all with the same number of decimals."""
         values = [value for row in self.rows.values() for value in row if value is not None]
         digits = max(len(f"{value:.10g}".partition(".")[2]) for value in values)

@@ -85,7 +85,7 @@ def find_crops(runs: Sequence[RunFolder], scene: Scene, background: Background) 
 
 
 def _file(run: RunFolder, view: View) -> Path:
-    return image_path(run.renders, view.name)
+    return image_path(run.render_folder, view.name)
 
 
 def _crop(view: str, photograph: Image, renders: list[Image]) -> ImageCrop:

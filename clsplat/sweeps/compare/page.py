@@ -15,7 +15,7 @@ from clsplat.core.errors import ConfigError, DataError, pluralize
 from clsplat.core.files import write_text
 from clsplat.core.page import data_url, duration_text, mark_charts_safe, render
 from clsplat.pipeline.file import SceneSettings
-from clsplat.runs.results import Points, RunFolder, RunMetrics
+from clsplat.runs.results import Curve, RunFolder, RunMetrics
 from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing_keys
 from clsplat.sweeps.compare.crops import ImageCrop, find_crops
 from clsplat.training.records import PSNR_REPORTS, moving_average
@@ -37,7 +37,7 @@ METRICS = {  # by name: heading, number of decimals, and the function that selec
     "lpips": ("LPIPS ↓", 4, min),
 }
 CONDITIONS = {"lpips_input": "input range of LPIPS", "lpips_model": "LPIPS network"}
-MAX_SEEDS = 3  # of more seeds, only the number is shown
+MAX_SEEDS = 3  # if a row has more seeds, only their number is shown
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class TableCell:
 
     text: str
     deviation: str = ""
-    best: bool = False
+    is_best: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
     columns = []
     for name, (heading, digits, choose_best) in METRICS.items():
         means = [
-            [fmean(values) for row in rows if (values := row.figures("test", row.downscale, name))] for rows in groups
+            [fmean(values) for row in rows if (values := row.values("test", row.downscale, name))] for rows in groups
         ]
         if means and all(len(values) == len(scenes) for values in means):
             columns.append(Column(heading, _cells([[fmean(values)] for values in means], digits, choose_best)))
@@ -147,7 +147,7 @@ def differing_conditions(rows: Sequence[VariantRow]) -> Iterable[str]:
             yield f"The {name} differs between runs ({', '.join(sorted(values))})."
     for split, downscale in _measured_sizes(rows):
         means = [getattr(run.metrics, split).get(downscale) for row in rows for run in row.runs]
-        counts = {mean.color_views for mean in means if mean is not None and mean.figure("psnr_color") is not None}
+        counts = {mean.color_views for mean in means if mean is not None and mean.value("psnr_color") is not None}
         if len(counts) > 1:
             name = f"number of {_title(rows, split, downscale)} with a PSNR in the photos' colors"
             yield f"The {name} differs between runs ({', '.join(map(str, sorted(counts)))})."
@@ -166,9 +166,9 @@ def _training_size(rows: Sequence[VariantRow]) -> list[Group]:
 
 def _group(rows: Sequence[VariantRow], split: str, downscale: str) -> Group:
     columns = [
-        Column(heading, _cells([row.figures(split, downscale, name) for row in rows], digits, choose_best))
+        Column(heading, _cells([row.values(split, downscale, name) for row in rows], digits, choose_best))
         for name, (heading, digits, choose_best) in METRICS.items()
-        if any(row.figures(split, downscale, name) for row in rows)
+        if any(row.values(split, downscale, name) for row in rows)
     ]
     return Group(_title(rows, split, downscale), columns)
 
@@ -219,7 +219,7 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
     shows_means = sum(len(row.runs) for row in rows) > MAX_LINES
     suffix = " (means)" if shows_means and any(len(row.runs) > 1 for row in rows) else ""
 
-    def lines(get_points: Callable[[RunFolder], Points]) -> list[Line]:
+    def lines(get_points: Callable[[RunFolder], Curve]) -> list[Line]:
         if shows_means:
             row_means = [_mean([get_points(run) for run in row.runs]) for row in rows]
             return [
@@ -234,11 +234,11 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
             if len(dict(points := get_points(run))) > 1  # a single point is not a line
         ]
 
-    def test_points(run: RunFolder) -> Points:
-        return run.points("evaluate", "psnr", split="test", downscale=downscale)
+    def test_points(run: RunFolder) -> Curve:
+        return run.curve("evaluate", "psnr", split="test", downscale=downscale)
 
-    def training_points(run: RunFolder) -> Points:
-        points = run.points("train", "psnr")
+    def training_points(run: RunFolder) -> Curve:
+        points = run.curve("train", "psnr")
         return list(zip([step for step, _ in points], moving_average([psnr for _, psnr in points]), strict=True))
 
     charts = [
@@ -248,12 +248,12 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
             lines(lambda run: run.over_cpu_seconds(test_points(run))),
         ),
         curve(f"training PSNR over steps, mean of {PSNR_REPORTS} views, dB{suffix}", lines(training_points)),
-        curve(f"Gaussians over steps{suffix}", lines(lambda run: run.points("train", "gaussians"))),
+        curve(f"Gaussians over steps{suffix}", lines(lambda run: run.curve("train", "gaussians"))),
     ]
     return mark_charts_safe(charts + _size_charts(rows, "test") + _size_charts(rows, "train"))
 
 
-def _mean(lines: Sequence[Points]) -> Points:
+def _mean(lines: Sequence[Curve]) -> Curve:
     """Return the pointwise mean of several lines, up to the end of the shortest line."""
     return [(fmean(x for x, _ in points), fmean(y for _, y in points)) for points in zip(*lines, strict=False)]
 
@@ -282,7 +282,7 @@ def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
     for metric, title in (("psnr", f"{split} PSNR by image size, dB"), ("ssim", f"{split} SSIM by image size")):
         lines = []
         for row in rows:
-            points = [(float(i), row.figures(split, size, metric)) for i, size in enumerate(sizes)]
+            points = [(float(i), row.values(split, size, metric)) for i, size in enumerate(sizes)]
             lines.append(Line([(i, fmean(values)) for i, values in points if values], color=row.variant.color))
         charts.append(curve(title, lines, ticks=ticks))
     return charts
@@ -304,7 +304,7 @@ def write_comparison(
     remarks: sentences to show at the top.  Raises the errors of `RunComparison.read`.
     """
     comparison = RunComparison.read(paths)
-    warnings = [warning for run in comparison.runs for warning in run.missing_plugins]
+    warnings = [warning for run in comparison.runs for warning in run.plugin_faults]
     for warning in warnings:
         LOG.warning("%s", warning)
     write_text(out, comparison_page(comparison, title, [*remarks, *warnings], out.parent, published))
@@ -366,7 +366,7 @@ def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
         main=main_table(rows),
         others=other_tables(rows),
         curves=curves(rows),
-        crops=[_figure(crop) for crop in crops],
+        crops=[_crop_values(crop) for crop in crops],
         no_crops=no_crops,
     )
 
@@ -384,7 +384,7 @@ def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene
     try:
-        original, background = settings.read(runs[0].photographs)
+        original, background = settings.read(runs[0].photo_folder)
         scene = original.downscaled(settings.downscale)
     except (DataError, ConfigError) as error:
         LOG.warning("no crops: %s", error)
@@ -393,7 +393,7 @@ def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
     return crops, "" if crops else "no view was rendered by all runs; add `- render` to the stages"
 
 
-def _figure(crop: ImageCrop) -> dict[str, Any]:
+def _crop_values(crop: ImageCrop) -> dict[str, Any]:
     """Return the values of the template for a crop.  Images are data URLs; the crops are PNG, which is lossless."""
     return dict(
         view=crop.view,
