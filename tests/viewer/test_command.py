@@ -14,7 +14,7 @@ from clsplat.core.errors import ConfigError, OutputError
 from clsplat.core.progress import listening
 from clsplat.pipeline.files import shipped_pipelines
 from clsplat.pipeline.loading import load
-from clsplat.runs.video import names
+from clsplat.runs.video import model_names
 from clsplat.scene.detect import read_scene
 from clsplat.stages.render import Viewer
 from clsplat.viewer import page as module
@@ -190,13 +190,16 @@ def test_no_device_is_opened(run, tmp_path, monkeypatch):
 def test_names_of_models(tmp_path):
     for name in ("a/run", "b/run", "other"):
         (tmp_path / name).mkdir(parents=True)
-    assert names([tmp_path / "a" / "run", tmp_path / "other"]) == ["run", "other"]
-    assert names([tmp_path / "a" / "run", tmp_path / "b" / "run"]) == ["a/run", "b/run"]
-    assert names([tmp_path / "x" / "point_cloud.ply", tmp_path / "y" / "point_cloud.ply"]) == [
+    assert model_names([tmp_path / "a" / "run", tmp_path / "other"]) == ["run", "other"]
+    assert model_names([tmp_path / "a" / "run", tmp_path / "b" / "run"]) == ["a/run", "b/run"]
+    assert model_names([tmp_path / "x" / "point_cloud.ply", tmp_path / "y" / "point_cloud.ply"]) == [
         "x/point_cloud",
         "y/point_cloud",
     ]
-    assert names([tmp_path / "other", tmp_path / "other"])[0] != names([tmp_path / "other", tmp_path / "other"])[1]
+    assert (
+        model_names([tmp_path / "other", tmp_path / "other"])[0]
+        != model_names([tmp_path / "other", tmp_path / "other"])[1]
+    )
 
 
 def test_help_describes_what_is_shown():
