@@ -19,7 +19,7 @@ TEXTS = {  # what turns results into lines of text, which the commands print
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.prepare.inspect.findings": {"show"},
     "clsplat.runs.status": {"status_text", "summary"},
-    "clsplat.runs.verify": {"lines", "verdict"},
+    "clsplat.runs.verify": {"format_files", "verdict"},
     "clsplat.sweeps.status": {"overview_text"},
     "clsplat.workflows.align": {"table"},
     "clsplat.workflows.blocks": {"status_table", "table"},
