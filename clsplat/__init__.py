@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from clsplat.api.trainer import Trainer as Trainer
     from clsplat.core import errors as errors
     from clsplat.core.resources import __version__ as __version__
-    from clsplat.formats.splats import Reading as Reading
-    from clsplat.formats.splats import Writing as Writing
+    from clsplat.formats.splats import ReadOptions as ReadOptions
+    from clsplat.formats.splats import WriteOptions as WriteOptions
     from clsplat.gaussians.model import Model as Model
     from clsplat.gaussians.model import Rendering as Rendering
     from clsplat.gaussians.model import load as load
@@ -98,7 +98,7 @@ _EXPORTS = {  # modules that define the names; `import clsplat` does not import 
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_speed read_measurement",
     "clsplat.api.trainer": "Report Trainer",
     "clsplat.core.resources": "__version__",
-    "clsplat.formats.splats": "Reading Writing",
+    "clsplat.formats.splats": "ReadOptions WriteOptions",
     "clsplat.gaussians.model": "load Model Rendering",
     "clsplat.nerf.files": "FieldModel load_field",
     "clsplat.opencl.device": "Device",

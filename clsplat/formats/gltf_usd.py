@@ -33,7 +33,7 @@ from clsplat.formats.splats import (
     SH_C0,
     Parameters,
     SplatFile,
-    Writing,
+    WriteOptions,
     concatenate,
     flip_axes,
     opacities,
@@ -366,7 +366,7 @@ def read_gltf(path: Path) -> SplatFile:
     )
 
 
-def write_glb(path: Path, splats: SplatFile, options: Writing) -> str:
+def write_glb(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     """Write Gaussians as one primitive; return the SHA-256 of the file.  Raises OutputError."""
     require_gaussians(path, splats)
     p = flip_axes(splats.parameters)
@@ -477,7 +477,7 @@ def ParticleField3DGaussianSplat "Gaussians"
 """
 
 
-def write_usda(path: Path, splats: SplatFile, options: Writing) -> str:
+def write_usda(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     """Write a `.usda` file; return its SHA-256.  Raises OutputError."""
     require_gaussians(path, splats)
     p = flip_axes(splats.parameters)

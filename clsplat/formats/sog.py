@@ -48,7 +48,7 @@ from clsplat.formats.splats import (
     Parameters,
     Quality,
     SplatFile,
-    Writing,
+    WriteOptions,
     logits,
     opacities,
     require_gaussians,
@@ -336,7 +336,7 @@ DIGITS = 16  # digits of the SHA-256 in the names of images in a folder
 EPOCH = (1980, 1, 1, 0, 0, 0)  # time of files in the ZIP, fixed so that the same model gives the same bytes
 
 
-def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
+def write_sog(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     """Write a `.sog` file, or a folder if the name is meta.json, and return the SHA-256 of that file.
 
     The names of images in a folder include a hash, so that images of another model are never replaced.
@@ -348,7 +348,7 @@ def write_sog(path: Path, splats: SplatFile, options: Writing) -> str:
     return write_ordered_sog(path, ordered, log_weights(ordered.parameters, ordered.has_sky), options)
 
 
-def write_ordered_sog(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: Writing) -> str:
+def write_ordered_sog(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: WriteOptions) -> str:
     """Write a SOG as `write_sog` does, but keep the order of the splats.
 
     weights: base-2 logarithms, [N], from `log_weights` of the entire model, of which the splats may be a subset.
@@ -462,7 +462,9 @@ def _training_entries(count: int, quality: Quality) -> int:
     return min(PALETTES[quality], max(1, int(BASE_ENTRIES * 2.0 ** np.floor(np.log2(count / BASE_ENTRIES)))))
 
 
-def _quantize(p: Parameters, weights: NDArray[np.float64], options: Writing) -> tuple[Parameters, Harmonics | None]:
+def _quantize(
+    p: Parameters, weights: NDArray[np.float64], options: WriteOptions
+) -> tuple[Parameters, Harmonics | None]:
     """Round the tables; return them and a palette of the SH, or None if there are no SH bands above 0.
 
     If the SH already form a palette, training has rounded all tables, and they stay unchanged.

@@ -23,7 +23,7 @@ from clsplat.formats.splats import (
     SH_C0,
     Parameters,
     SplatFile,
-    Writing,
+    WriteOptions,
     concatenate,
     logits,
     logs,
@@ -79,7 +79,7 @@ def read_splat(path: Path) -> SplatFile:
     return SplatFile(parameters)
 
 
-def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
+def write_splat(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     """Write a `.splat` file; return its SHA-256.  Raises DataError for a model without Gaussians, and OutputError."""
     require_gaussians(path, splats)
     p = splats.parameters
@@ -94,10 +94,7 @@ def write_splat(path: Path, splats: SplatFile, options: Writing) -> str:
     color = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
     warn_clipped(path, "splat", "colors from 0 to 1", exceeds_byte(255 * color))
     if p["sh_rest"].shape[1]:
-        LOG.warning(
-            "%s: .splat stores no SH coefficients, so colors do not depend on the view; other formats do",
-            path,
-        )
+        LOG.warning("%s: .splat stores no SH coefficients, so colors do not depend on the view; other formats do", path)
     rows["color"] = np.clip(np.rint(255 * color), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
     return write_bytes(path, rows[order].tobytes())

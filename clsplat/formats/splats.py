@@ -128,7 +128,7 @@ class SplatFile:
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadOptions:
     """Options for reading a model."""
 
     not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # Gaussians with NaN or infinity
@@ -136,7 +136,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Writing:
+class WriteOptions:
     """Options for writing a model."""
 
     quality: Quality = "balanced"  # SPZ and SOG
@@ -284,7 +284,7 @@ def _row_exceeds_limit(table: Floats) -> NDArray[np.bool_]:
     return np.asarray(((magnitude > MAX_VALUE) & (magnitude < np.inf)).any(axis=1))
 
 
-def clamp_limits(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
+def clamp_limits(path: Path, splats: SplatFile, options: ReadOptions) -> SplatFile:
     """Replace infinite logits (opacities 0 and 1) and log scales (zero scales) with finite values, and warn."""
     logit, log_scales = (splats.parameters[name] for name in ("logit_opacity", "log_scales"))
     is_infinite, is_flat = np.isinf(logit), np.isneginf(log_scales)
@@ -315,7 +315,7 @@ def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
     return logits(alpha)
 
 
-def handle_not_finite(path: Path, splats: SplatFile, options: Reading) -> SplatFile:
+def handle_not_finite(path: Path, splats: SplatFile, options: ReadOptions) -> SplatFile:
     """Reject, drop, or keep Gaussians with NaN or infinity, depending on `options.not_finite`.
 
     "drop" also drops Gaussians with values that are too large, or with quaternions of length 0.  Raises DataError.

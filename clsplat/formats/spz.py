@@ -51,9 +51,9 @@ from clsplat.formats.splats import (
     MAX_STORED_DEGREE,
     PARAMETERS,
     Parameters,
-    Reading,
+    ReadOptions,
     SplatFile,
-    Writing,
+    WriteOptions,
     flip_axes,
     flip_axes_in_place,
     logits,
@@ -183,15 +183,14 @@ def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) 
         LOG.warning(
             "%s: because of its largest coordinate, %g, SPZ rounds all positions to %.3g instead of %.3g scene units; "
             "crop the model for more precision",
-            path,
-            max_value,
-            2.0**-bits,
-            2.0**-target_bits,
+            *(path, max_value, 2.0**-bits, 2.0**-target_bits),
         )
     return bits
 
 
-def pack_planes(path: Path, p: Parameters, weights: NDArray[np.float64], bits: int, options: Writing) -> list[bytes]:
+def pack_planes(
+    path: Path, p: Parameters, weights: NDArray[np.float64], bits: int, options: WriteOptions
+) -> list[bytes]:
     """Return the bytes of the planes.  Values outside their range are clipped, with a warning.
 
     weights: base-2 logarithms, [N], from `log_weights`.  Gaussians with fine SH steps come first, because
@@ -241,7 +240,7 @@ def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
     return rotations.astype("<u4").tobytes()
 
 
-def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: Writing) -> NDArray[np.float32]:
+def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: WriteOptions) -> NDArray[np.float32]:
     """Return the rounding step of each Gaussian's SH, [N], in levels of 1/128; all steps are 1 for quality `high`."""
     max_step = MAX_STEP[options.quality]
     if max_step == 1 or not rest.shape[1]:
@@ -326,7 +325,7 @@ QUARTER_TURN = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # makes y the ver
 EXPECTED = "an SPZ file"
 
 
-def read_spz(path: Path, options: Reading) -> SplatFile:
+def read_spz(path: Path, options: ReadOptions) -> SplatFile:
     """Read an SPZ file.  Raises DataError if it is missing or damaged, MemoryLimitError if it is too large."""
     splats, axes = decode_spz(path, read_file(path, EXPECTED, limit=MAX_FILE))
     if not options.quiet:
@@ -349,7 +348,7 @@ def decode_spz(path: Path, data: bytes) -> tuple[SplatFile, str]:
     return SplatFile(parameters, {}, "mip" if header.flags & MIP else "default"), axes
 
 
-def write_spz(path: Path, splats: SplatFile, options: Writing) -> str:
+def write_spz(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     """Write an SPZ file and return its SHA-256.
 
     Splats with finer SH steps come first; splats with equal steps follow a Morton curve.

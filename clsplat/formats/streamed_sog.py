@@ -25,7 +25,7 @@ from clsplat.formats.sog_quantize import log_weights
 from clsplat.formats.splats import (
     Parameters,
     SplatFile,
-    Writing,
+    WriteOptions,
     concatenate,
     require_gaussians,
     require_in_range,
@@ -258,7 +258,7 @@ DEFAULT_LIMITS = LeafLimits()
 
 
 def write_lod(
-    folder: Path, levels: Sequence[SplatFile], options: Writing | None = None, limits: LeafLimits = DEFAULT_LIMITS
+    folder: Path, levels: Sequence[SplatFile], options: WriteOptions | None = None, limits: LeafLimits = DEFAULT_LIMITS
 ) -> str:
     """Write levels, finest first, into a folder; return the SHA-256 of its JSON, which is written last.
 
@@ -283,7 +283,7 @@ def write_lod(
     weights = [log_weights(level.parameters, level.has_sky) for level in levels]
     for name, (index, parts) in files.rows.items():
         rows = np.concatenate(parts)
-        write_ordered_sog(folder / name, levels[index].rows(rows), weights[index][rows], options or Writing())
+        write_ordered_sog(folder / name, levels[index].rows(rows), weights[index][rows], options or WriteOptions())
     return write_bytes(folder / LOD_META, json.dumps(meta, separators=(",", ":"), allow_nan=False).encode())
 
 

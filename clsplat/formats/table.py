@@ -19,9 +19,9 @@ from clsplat.formats.splat import looks_like_ksplat, looks_like_splat, read_kspl
 from clsplat.formats.splats import (
     MIP_VARIANCE,
     VARIANCE,
-    Reading,
+    ReadOptions,
     SplatFile,
-    Writing,
+    WriteOptions,
     clamp_limits,
     default_near,
     handle_not_finite,
@@ -59,14 +59,14 @@ class Codec:
     name: str
     endings: tuple[str, ...]  # of file names
     matches: Callable[[Start], bool]
-    read: Callable[[Path, Reading], SplatFile] | None = None
-    write: Callable[[Path, SplatFile, Writing], str] | None = None  # returns the SHA-256
+    read: Callable[[Path, ReadOptions], SplatFile] | None = None
+    write: Callable[[Path, SplatFile, WriteOptions], str] | None = None  # returns the SHA-256
     command: str = ""  # the only command that writes this format
     keeps_all: bool = False  # the world filter, motion, values that are not finite, and positions in float64
     keeps_mode: bool = True  # whether a model is a mip model
     keeps_rendering: bool = False  # rendering settings
     keeps_origin: bool = False  # apart from the rendering settings
-    has_quality: bool = False  # writing uses Writing.quality
+    has_quality: bool = False  # writing uses WriteOptions.quality
     has_magic: bool = True  # a magic number, or another clear mark at the start of files
 
 
@@ -209,9 +209,9 @@ def format_from_name(path: Path) -> Codec | None:
     return max(matches, key=lambda pair: len(pair[0]))[1] if matches else None
 
 
-def read(path: Path, options: Reading | None = None) -> SplatFile:
+def read(path: Path, options: ReadOptions | None = None) -> SplatFile:
     """Read a model file of any format.  Raises DataError if it is missing, damaged, or of an unknown format."""
-    options = options or Reading()
+    options = options or ReadOptions()
     path = model_file(path)
     codec = detect(path) or format_from_name(path)  # the reader of the named format reports what is wrong
     if codec is None:
@@ -238,7 +238,7 @@ def writing_format(path: Path) -> Codec:
     return codec
 
 
-def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
+def write(path: Path, splats: SplatFile, options: WriteOptions | None = None) -> str:
     """Write a model file in the format of its name; warn about losses unless `options.quiet`.
 
     Returns the SHA-256 of the file; for a SOG folder, that of its meta.json.
@@ -256,7 +256,7 @@ def write(path: Path, splats: SplatFile, options: Writing | None = None) -> str:
             f"{path}: {count:,} Gaussians have values that are not finite, which {codec.name} cannot store; drop them "
             "with `clsplat convert`, or write a PLY"
         )
-    options = options or Writing()
+    options = options or WriteOptions()
     if not options.quiet:
         warn_about_losses(path, splats)
     if codec.keeps_rendering:

@@ -24,8 +24,8 @@ from clsplat.formats.splats import (
     SH_C0,
     Parameters,
     Quality,
-    Reading,
-    Writing,
+    ReadOptions,
+    WriteOptions,
     is_timestamp,
     sh_coefficients,
     with_degree,
@@ -112,13 +112,13 @@ class Changes:
         return result
 
 
-def writing_options(out: Path, quality: Quality, changes: Changes) -> Writing:
+def writing_options(out: Path, quality: Quality, changes: Changes) -> WriteOptions:
     """Return the options for writing a file.  Raises ConfigError if the quality is unknown or has no effect."""
     if quality not in QUALITIES:
         raise ConfigError(f"--quality {quote(quality)}: expected one of {', '.join(QUALITIES)}")
     if quality != "balanced" and not writing_format(out).has_quality:
         raise ConfigError(f"{out}: --quality is only for SPZ and SOG; use a name that ends in .spz or .sog")
-    return Writing(quality, world=changes.world)
+    return WriteOptions(quality, world=changes.world)
 
 
 def convert(
@@ -138,11 +138,11 @@ def convert(
 
 def read(sources: Sequence[Path]) -> Model:
     """Read and merge model files or run folders, without Gaussians that are not finite.  Raises DataError."""
-    models = [load(exported_model(source), Reading(not_finite="drop")) for source in sources]
+    models = [load(exported_model(source), ReadOptions(not_finite="drop")) for source in sources]
     return merge_models(models, [str(source) for source in sources])
 
 
-def write_model(sources: Sequence[Path], model: Model, out: Path, options: Writing) -> dict[str, Any]:
+def write_model(sources: Sequence[Path], model: Model, out: Path, options: WriteOptions) -> dict[str, Any]:
     """Write a model that was read from `sources`, and return the same dictionary as `convert`.  Raises OutputError."""
     size = sum(model_bytes(model_path(source)) for source in sources)
     model.save(out, options)

@@ -24,9 +24,9 @@ from clsplat.formats.splats import (
     PARAMETERS,
     SH_C0,
     VARIANCE,
-    Reading,
+    ReadOptions,
     SplatFile,
-    Writing,
+    WriteOptions,
     columns_to_sh_degree,
     default_near,
     inverse_opacities,
@@ -299,7 +299,7 @@ class Model:
         logits = np.clip(logit, MIN_LOGIT, -MIN_LOGIT).astype(np.float32)
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 
-    def save(self, path: str | Path, options: Writing | None = None) -> str:
+    def save(self, path: str | Path, options: WriteOptions | None = None) -> str:
         """Write a file in the format of its name: .ply, .spz, .sog, .glb, and others (docs/formats.md).
 
         A PLY stores a world filter as the property `filter_3D`; for other formats, it is baked.  A sky is written next
@@ -376,7 +376,7 @@ def is_float32_precise(means: NDArray[np.floating], log_scales: Floats) -> bool:
     return bool(spacing <= MAX_SPACING * np.exp(min(float(np.median(log_scales)), MAX_LOG)))
 
 
-def load(path: str | Path, options: Reading | None = None) -> Model:
+def load(path: str | Path, options: ReadOptions | None = None) -> Model:
     """Read a model file of any format (docs/formats.md), or the model of a run folder.
 
     If the file has no origin and float32 is not precise enough for its means, an origin near them is chosen.

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.reading import open_file
 from clsplat.formats.ply import MAX_HEADER
-from clsplat.formats.splats import Reading, motion_fields, not_finite, too_large_message, typical_size
+from clsplat.formats.splats import ReadOptions, motion_fields, not_finite, too_large_message, typical_size
 from clsplat.formats.streamed_sog import LOD_META, find_level_faults
 from clsplat.formats.table import detect, format_from_name, model_file
 from clsplat.gaussians.model import Model, load
@@ -46,7 +46,7 @@ def examine(path: Path) -> dict[str, Any]:
     Raises DataError if the file cannot be read.
     """
     codec = detect(model_file(path))
-    model = load(path, Reading(not_finite="keep"))
+    model = load(path, ReadOptions(not_finite="keep"))
     is_nonfinite = not_finite(model.tables())
     subset = model[~is_nonfinite] if is_nonfinite.any() else model
     fault = f"{int(is_nonfinite.sum()):,} of {len(model):,} Gaussians have values that are not finite"

@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 # Points that are marked in photos.
 
 MIN_ANGLE = math.radians(1)  # between two rays to a point; smaller ones do not determine its depth
-MAX_MISS = 10.0  # px from a mark to the point of the scene that it selects
+MAX_MARK_ERROR = 10.0  # px from a mark to the point of the scene that it selects
 MIN_ERROR = 2.0  # px: a mark with a smaller error is not an outlier
 
 
@@ -48,11 +48,11 @@ class LocatedMark:
 
 @dataclass(frozen=True)
 class MarkedPoint:
-    """A point with its marks, and its known coordinates if it has any."""
+    """A point with its marks, and its coordinates if they are known."""
 
     name: str
     marks: tuple[Mark, ...] = ()
-    known: tuple[float, float, float] | None = None
+    coordinates: tuple[float, float, float] | None = None
 
     def locate(self, scene: Scene) -> tuple[Floats, list[LocatedMark]]:
         """Return the position of the point in the coordinates of `scene`, [3], and the error of each mark.
@@ -87,14 +87,14 @@ class MarkedPoint:
         rows = scene.tracks.rows.get(view.name) if scene.tracks else None
         if scene.tracks is None or rows is None or not len(rows):
             raise DataError(
-                f"point {quote(self.name)}: has only one mark, in {self.marks[0].photo}; mark it in another"
+                f"point {quote(self.name)}: has only one mark, in {self.marks[0].photo}; mark it in another photo"
             )
         positions = scene.tracks.positions[rows].astype(np.float64)
         errors = np.nan_to_num(np.linalg.norm(project_points(view, positions) - pixels, axis=1), nan=np.inf)
         nearest = int(errors.argmin())
-        if not errors[nearest] <= MAX_MISS:
+        if not errors[nearest] <= MAX_MARK_ERROR:
             raise DataError(
-                f"point {quote(self.name)}: no point of the scene is within {MAX_MISS:g} px of its mark in "
+                f"point {quote(self.name)}: no point of the scene is within {MAX_MARK_ERROR:g} px of its mark in "
                 f"{self.marks[0].photo}; mark it in another photo, too"
             )
         return positions[nearest], [LocatedMark(self.marks[0], float(errors[nearest]))]
@@ -106,8 +106,8 @@ def find_view(scene: Scene, photo: str) -> View:
         views = [view for view in scene.views if key(view.name) == key(photo)]
         if len(views) == 1:
             return views[0]
-    near = difflib.get_close_matches(photo, [view.name for view in scene.views], n=1)
-    hint = f"; did you mean {quote(near[0])}?" if near else "; use a name from the dataset"
+    matches = difflib.get_close_matches(photo, [view.name for view in scene.views], n=1)
+    hint = f"; did you mean {quote(matches[0])}?" if matches else "; use a name from the dataset"
     raise DataError(f"no photo, or more than one, is named {quote(photo)}{hint}")
 
 
@@ -160,23 +160,24 @@ def read_control(path: Path) -> dict[str, MarkedPoint]:
             source = f"{path}:{reader.line_num}"
             name, photo = ((row[key] or "").strip() for key in ("point", "photo"))
             if not name or not photo or set(name) & set(",;=:+"):
-                raise DataError(f"{source}: expected the name of a point, without , ; = : +, and of a photo")
-            pixel = [_number(source, key, row[key]) for key in ("u", "v")]
+                raise DataError(f"{source}: expected a photo, and a point name without , ; = : +")
+            pixel = [_parse_number(source, key, row[key]) for key in ("u", "v")]
             texts = [(row[key] or "").strip() for key in "xyz"]
-            known = None
+            coordinates = None
             if any(texts):
-                x, y, z = (_number(source, key, text) for key, text in zip("xyz", texts, strict=True))
-                known = (x, y, z)
+                x, y, z = (_parse_number(source, key, text) for key, text in zip("xyz", texts, strict=True))
+                coordinates = (x, y, z)
             old = points.get(name, MarkedPoint(name))
-            if known and old.known and known != old.known:
-                raise DataError(f"{source}: point {quote(name)} has other coordinates above; give one of them")
-            points[name] = MarkedPoint(name, (*old.marks, Mark(photo, (pixel[0], pixel[1]))), known or old.known)
+            if coordinates and old.coordinates and coordinates != old.coordinates:
+                raise DataError(f"{source}: point {quote(name)} has other coordinates in an earlier row; correct one")
+            mark = Mark(photo, (pixel[0], pixel[1]))
+            points[name] = MarkedPoint(name, (*old.marks, mark), coordinates or old.coordinates)
     except csv.Error as error:
         raise DataError(f"{path}:{reader.line_num}: {error}; expected rows of {','.join(COLUMNS)}") from error
     return points
 
 
-def _number(source: str, name: str, text: str | None) -> float:
+def _parse_number(source: str, name: str, text: str | None) -> float:
     try:
         value = float(text or "")
     except ValueError:
@@ -200,10 +201,10 @@ class ScaleBar:
 
         Two names may also be separated by a comma.  Raises ConfigError.
         """
-        ends, _, number = text.rpartition("=")
+        ends, _, length_text = text.rpartition("=")
         parts = ends.split(";") if ";" in ends else ends.split(",")
         try:
-            length = float(number)
+            length = float(length_text)
             if len(parts) != 2 or not 0 < length < MAX_VALUE:
                 raise ValueError
             first, second = (_parse_end(part.strip(), points) for part in parts)
@@ -257,7 +258,7 @@ FALSE_EASTING, FALSE_NORTHING = 500_000.0, 10_000_000.0  # m
 class GpsPositions:
     """The GPS positions of photos in one UTM zone."""
 
-    views: list[View]  # those with a position, one for each photo
+    views: list[View]  # of the photos with a position, one for each photo
     positions: Floats = field(repr=False)  # [N, 3] easting, northing, altitude, m
     epsg: int  # code of the coordinate system
 

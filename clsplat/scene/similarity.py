@@ -156,17 +156,17 @@ def fit_without_outliers(
     minimum + 2 observations are all inliers, because an outlier cannot be distinguished.  floor: the distance below
     which no observation is an outlier.
     """
-    every = np.arange(count)
+    all_rows = np.arange(count)
     if count < minimum + 2:
-        return fit(every), np.zeros(count, bool)
+        return fit(all_rows), np.zeros(count, bool)
     middle = (count + minimum + 1) // 2 - 1  # highest breakdown point
     best = min(map(fit, _samples(count, minimum)), key=lambda model: np.partition(distances(model), middle)[middle])
     scale = CUT * (1 + 5 / (count - minimum))  # small samples underestimate the median
     errors, is_inlier = distances(best), np.zeros(count, bool)
     limit = max(floor, scale * float(np.partition(errors, middle)[middle]))
     for _ in range(MAX_ROUNDS):
-        is_before, is_inlier = is_inlier, errors <= limit
-        if (is_inlier == is_before).all():
+        was_inlier, is_inlier = is_inlier, errors <= limit
+        if (is_inlier == was_inlier).all():
             break
         best = fit(np.flatnonzero(is_inlier))
         errors = distances(best)
@@ -190,9 +190,9 @@ UP = np.array([0.0, -1.0, 0.0])  # as in an OpenCV camera; the viewer and other 
 def level(
     up: NDArray[np.floating], anchor: NDArray[np.floating], height: float | None = None, scale: float = 1.0
 ) -> Similarity:
-    """Return the transform that turns `up`, [3], unit, to -y and scales, and leaves `anchor`, [3], where it is.
+    """Return the transform that rotates the unit vector `up`, [3], to -y, and scales around the point `anchor`, [3].
 
-    height: of the ground along `up`, which is moved to y = 0.
+    height: of the ground along `up`; the ground is moved to y = 0.
     """
     rotation, target = rotation_between(np.asarray(up, np.float64), UP), np.array(anchor, np.float64)
     if height is not None:

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from clsplat.core.errors import DataError, OutputError, size_text
 from clsplat.core.reading import sha256
-from clsplat.formats.splats import Quality, Reading, Writing
+from clsplat.formats.splats import Quality, ReadOptions, WriteOptions
 from clsplat.formats.table import endings, writing_format
 from clsplat.gaussians.conversion import COUNT, with_sky_splats
 from clsplat.gaussians.model import load
@@ -69,12 +69,12 @@ class Export(Scheduled):
             files = {path: with_sky_splats(model, center=sky_center(run)), without_sky: model.baked()}
         if model.filter_variance is not None:
             files[raw_path] = model
-        options = Writing(quality=self.quality)
+        options = WriteOptions(quality=self.quality)
         for file, exported_model in files.items():
             run.model_hashes[_name(file, run)] = exported_model.save(file, options)
             try:
                 if writing_format(file).read:
-                    load(file, Reading(quiet=True))
+                    load(file, ReadOptions(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; the file was just written: check the disk and its free space") from error
             LOG.debug("%s written to %s", size_text(len(model), None, len(exported_model) - len(model)), file)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.text_table import text_table
-from clsplat.formats.splats import Writing
+from clsplat.formats.splats import WriteOptions
 from clsplat.formats.table import format_from_name, model_file
 from clsplat.gaussians.conversion import check_output, write_model
 from clsplat.gaussians.model import Model, load, model_path
@@ -202,16 +202,16 @@ def _gps_targets(subject: Subject) -> Targets:
 
 def _control_targets(subject: Subject, file: Path | None, points: Mapping[str, MarkedPoint]) -> Targets:
     """Return the points with known coordinates, located in the scene.  Raises ConfigError, DataError."""
-    known = [point for point in points.values() if point.known is not None]
-    if not known:
+    controls = [point for point in points.values() if point.coordinates is not None]
+    if not controls:
         return Targets([], np.zeros((0, 3)), np.zeros((0, 3)), [])
     scene = subject.require_scene("--control")
     try:
-        located = [point.locate(scene) for point in known]
+        located = [point.locate(scene) for point in controls]
     except DataError as error:
         raise DataError(f"{file}: {error}") from error
-    source, target = np.stack([position for position, _ in located]), np.array([point.known for point in known])
-    return Targets([point.name for point in known], source, target, [marks for _, marks in located])
+    source, target = np.stack([position for position, _ in located]), np.array([p.coordinates for p in controls])
+    return Targets([point.name for point in controls], source, target, [marks for _, marks in located])
 
 
 def align(
@@ -243,7 +243,7 @@ def align(
         model = subject.model.transformed(transform.scale, transform.rotation, transform.translation)
     except ValueError as error:
         raise DataError(f"{path}: {error}") from error
-    return {**alignment.data(), "files": [write_model([path], model, out, Writing())["file"]]}
+    return {**alignment.data(), "files": [write_model([path], model, out, WriteOptions())["file"]]}
 
 
 def table(result: Mapping[str, Any]) -> str:

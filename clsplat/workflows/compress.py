@@ -15,7 +15,7 @@ from clsplat.core.page import mark_charts_safe, render
 from clsplat.core.reading import read_file, sha256
 from clsplat.core.text_table import text_table
 from clsplat.formats.packing import open_hashed
-from clsplat.formats.splats import Quality, Reading, Writing, require_static, with_degree
+from clsplat.formats.splats import Quality, ReadOptions, WriteOptions, require_static, with_degree
 from clsplat.formats.table import model_bytes, model_file, warn_about_losses
 from clsplat.gaussians.model import MODEL, load
 from clsplat.gaussians.sky import read_sky_file, write_sky_file
@@ -332,8 +332,8 @@ def _measure_rung(ladder: Ladder, source: Path, keep: float, file_format: Format
             _copy(ladder.train_sog(source, name, degree, quality), file)
         else:
             reduced_model = replace(model, sh_rest=with_degree(model.tables(), degree)["sh_rest"])
-            reduced_model.save(file, Writing(quality=quality, quiet=True))
-        size, measurements = file.stat().st_size, measurer.mean_metrics(load(file, Reading(quiet=True)))
+            reduced_model.save(file, WriteOptions(quality=quality, quiet=True))
+        size, measurements = file.stat().st_size, measurer.mean_metrics(load(file, ReadOptions(quiet=True)))
         entry = Entry(f"{TRIALS}/{file.name}", keep, degree, quality, len(model), size, *measurements)
         LOG.info("%s: %.3g MB, %.2f dB", file.name, size / 1e6, entry.psnr)
         entries.append(entry)

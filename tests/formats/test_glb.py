@@ -13,7 +13,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.harmonics import basis
 from clsplat.core.reading import sha256
 from clsplat.formats.gltf_usd import write_glb
-from clsplat.formats.splats import SH_C0, Writing, flip_axes, opacities, unit
+from clsplat.formats.splats import SH_C0, WriteOptions, flip_axes, opacities, unit
 from clsplat.formats.table import detect, model_files, read, write
 from clsplat.gaussians.model import Model, load
 from tests.support.models import angles, assert_close, interop, join_glb, round_trip, splats, split_glb, spz_tree
@@ -201,7 +201,7 @@ REFUSED = {
 @pytest.mark.parametrize("fault", REFUSED)
 def test_damaged_glb_is_refused(fault, tmp_path, rng):
     changed, words = REFUSED[fault]
-    write_glb(tmp_path / "a.glb", splats(rng, 4, 0), Writing())
+    write_glb(tmp_path / "a.glb", splats(rng, 4, 0), WriteOptions())
     tree, binary = split_glb((tmp_path / "a.glb").read_bytes())
     changed(tree)
     (tmp_path / "a.glb").write_bytes(join_glb(tree, binary))

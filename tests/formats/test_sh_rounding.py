@@ -22,7 +22,7 @@ from clsplat.formats.sog_quantize import (
     tree_palette,
     visible_form,
 )
-from clsplat.formats.splats import SH_C0, SplatFile, Writing, unit
+from clsplat.formats.splats import SH_C0, SplatFile, WriteOptions, unit
 from clsplat.formats.table import read, write
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import Model, load
@@ -221,7 +221,7 @@ def test_spz_steps_grow_as_weights_fall(tmp_path, rng):
     )
     np.testing.assert_array_equal(levels, np.rint(levels / expected[:, None]) * expected[:, None])
     assert len(np.unique(expected)) > 4
-    write(tmp_path / "high.spz", source, Writing(quality="high"))
+    write(tmp_path / "high.spz", source, WriteOptions(quality="high"))
     assert (tmp_path / "a.spz").stat().st_size < 0.8 * (tmp_path / "high.spz").stat().st_size
     exact = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
     given = read(tmp_path / "high.spz").parameters["sh_rest"]

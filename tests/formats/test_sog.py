@@ -19,7 +19,7 @@ import pytest
 from clsplat.core.errors import DataError, OutputError
 from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, fit_codebook, fit_palette, nearest_entries
-from clsplat.formats.splats import Writing
+from clsplat.formats.splats import WriteOptions
 from clsplat.formats.table import detect, read, write
 from tests.support.data_sets import data_set
 from tests.support.models import assert_close, interop, round_trip, splats
@@ -52,7 +52,7 @@ def test_version_1_is_read():
 @pytest.mark.parametrize(("count", "degree"), [(1, 3), (63, 0), (300, 1), (1100, 2)])
 def test_sog_round_trip_is_within_its_steps(tmp_path, rng, count, degree):
     source = splats(rng, count, degree, "mip")
-    copy = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
+    copy = round_trip(tmp_path / "a.sog", source, WriteOptions(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
     assert (copy.mode, copy.rendering) == ("mip", source.rendering)
     assert_close(copy, expected, 0.8, means=0.002, log_scales=0.05, opacity=0.0101, sh_base=0.05, sh_rest=0.5)
@@ -128,7 +128,7 @@ def test_larger_palette_is_more_accurate(tmp_path, rng):
     source = splats(rng, 2050, 1)
     errors = []
     for quality in ("small", "balanced"):
-        actual = round_trip(tmp_path / "a.sog", source, Writing(quality=quality)).parameters["sh_rest"]
+        actual = round_trip(tmp_path / "a.sog", source, WriteOptions(quality=quality)).parameters["sh_rest"]
         expected = source.rows(morton_order(source.parameters["means"])).parameters["sh_rest"]
         errors.append(float(np.square(actual - expected).mean()))
     assert errors[1] < errors[0] < 0.1**2
@@ -195,7 +195,7 @@ def test_palette_does_not_depend_on_the_thread_count(rng):
 def test_transparent_splat_keeps_its_color(tmp_path, rng):
     source = splats(rng, 100, 0)
     source.parameters["logit_opacity"][:] = -20
-    copy = round_trip(tmp_path / "a.sog", source, Writing(quality="high"))
+    copy = round_trip(tmp_path / "a.sog", source, WriteOptions(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
     assert_close(copy, expected, 0.8, sh_base=0.1, opacity=1.01 / 255)
 
@@ -336,7 +336,7 @@ def sums(folder: Path, count: int = 24) -> list[str]:
     """The SHA-256 of so many models as SOG."""
     results = []
     for seed in range(count):
-        write(folder / "a.sog", splats(np.random.default_rng(seed), 60, 0), Writing(quiet=True))
+        write(folder / "a.sog", splats(np.random.default_rng(seed), 60, 0), WriteOptions(quiet=True))
         results.append(sha256((folder / "a.sog").read_bytes()).hexdigest())
     return results
 
@@ -362,7 +362,7 @@ def test_cpus_with_and_without_avx_512_write_equal_bytes(tmp_path):
 def test_position_precision_depends_only_on_the_range(place, tmp_path, rng):
     source = splats(rng, 400, 0)
     source.parameters["means"][:] += place
-    actual = round_trip(tmp_path / "a.sog", source, Writing(quality="high")).parameters["means"]
+    actual = round_trip(tmp_path / "a.sog", source, WriteOptions(quality="high")).parameters["means"]
     expected = source.rows(morton_order(source.parameters["means"])).parameters["means"]
     assert np.abs(actual - expected).max() < (0.05 if place == 5e5 else 1e-3)  # float32 holds steps of 0.03 there
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:

@@ -8,7 +8,7 @@ from clsplat.conformance import reference as ref
 from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, fit_codebook
 from clsplat.formats.sog_quantize import LEVELS, round_means, round_quats, round_to
-from clsplat.formats.splats import Writing, unit
+from clsplat.formats.splats import WriteOptions, unit
 from clsplat.formats.table import write
 from tests.support.models import round_trip, splats
 
@@ -59,11 +59,11 @@ def test_rounded_tables_are_written_exactly_in_fewer_bytes(tmp_path: Path, rng):
     source = splats(rng, 1500, 0)
     p = source.parameters
     p["log_scales"] -= 2
-    round_trip(tmp_path / "before.sog", source, Writing(quality="high"))
+    round_trip(tmp_path / "before.sog", source, WriteOptions(quality="high"))
     p["means"] = round_means(p["means"], p["log_scales"], np.zeros(1500), 0.5)
     p["quats"], p["log_scales"] = round_quats(p["quats"], p["log_scales"], 4)
     p["log_scales"], p["sh_base"] = round_to(p["log_scales"], 0.1), round_to(p["sh_base"], 0.06)
-    copy = round_trip(tmp_path / "after.sog", source, Writing(quality="high"))
+    copy = round_trip(tmp_path / "after.sog", source, WriteOptions(quality="high"))
     expected = source.rows(morton_order(p["means"]))
     for name in ("means", "quats", "log_scales", "sh_base"):
         np.testing.assert_allclose(copy.parameters[name], expected.parameters[name], rtol=1e-4, atol=1e-5)
@@ -76,6 +76,6 @@ def test_quality_matters_without_harmonics(tmp_path: Path, rng):
         source.parameters["sh_rest"][:] = 0
         sizes = []
         for quality in ("balanced", "high"):
-            write(tmp_path / "a.sog", source, Writing(quality=quality))
+            write(tmp_path / "a.sog", source, WriteOptions(quality=quality))
             sizes.append((tmp_path / "a.sog").stat().st_size)
         assert sizes[0] < 0.9 * sizes[1]

@@ -16,7 +16,7 @@ from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
 from clsplat.core.harmonics import basis
 from clsplat.formats.packing import morton_order
 from clsplat.formats.sog_quantize import log_weights
-from clsplat.formats.splats import Reading, Writing, flip_axes, unit
+from clsplat.formats.splats import ReadOptions, WriteOptions, flip_axes, unit
 from clsplat.formats.spz import AXES
 from clsplat.formats.table import detect, read, write
 from tests.support.models import angles, assert_close, interop, round_trip, splats, spz_version_4
@@ -26,7 +26,7 @@ STEPS = {"means": 2**-13, "log_scales": 1 / 32, "opacity": 0.501 / 255, "sh_base
 
 def version_4(path, source, **more):
     pytest.importorskip("zstandard")
-    write(path, source, Writing(**more))
+    write(path, source, WriteOptions(**more))
     path.write_bytes(spz_version_4(path.read_bytes()))
     return path.read_bytes()
 
@@ -57,7 +57,7 @@ def test_spz_of_another_program_equals_its_source(version):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_spz_round_trip_is_within_its_steps(tmp_path, rng, degree):
     source = splats(rng, 200, degree, "mip")
-    copy = round_trip(tmp_path / "a.spz", source, Writing(quality="high"))
+    copy = round_trip(tmp_path / "a.spz", source, WriteOptions(quality="high"))
     expected = source.rows(morton_order(source.parameters["means"]))
     assert copy.mode == "mip"
     assert_close(copy, expected, 0.25, sh_rest=1 / 256, **STEPS)
@@ -92,7 +92,7 @@ def test_positions_get_as_many_bits_as_needed(tmp_path, rng, caplog):
     ):
         write(tmp_path / "a.spz", source)
     source = splats(rng, 50)
-    fine = round_trip(tmp_path / "a.spz", source, Writing(quality="high")).parameters["means"]
+    fine = round_trip(tmp_path / "a.spz", source, WriteOptions(quality="high")).parameters["means"]
     assert np.abs(fine - source.rows(morton_order(source.parameters["means"])).parameters["means"]).max() < 2e-6
 
 
@@ -144,8 +144,8 @@ def test_axes_and_losses_are_reported_unless_the_caller_knows(tmp_path, rng, cap
         (text.split(":")[0], "does not store" in text, "read with the axes" in text) for text in caplog.messages
     ] == [(str(tmp_path / name), writes, not writes) for name in ("a.spz", "b.spz") for writes in (True, False)]
     caplog.clear()
-    write(tmp_path / "a.spz", first, Writing(quiet=True))
-    read(tmp_path / "a.spz", Reading(quiet=True))
+    write(tmp_path / "a.spz", first, WriteOptions(quiet=True))
+    read(tmp_path / "a.spz", ReadOptions(quiet=True))
     assert not caplog.messages
 
 

@@ -13,7 +13,7 @@ from clsplat.core.errors import ConfigError, DataError, OutputError
 from clsplat.core.files import new_folder
 from clsplat.formats import streamed_sog
 from clsplat.formats.packing import morton_order
-from clsplat.formats.splats import SplatFile, Writing, typical_size
+from clsplat.formats.splats import SplatFile, WriteOptions, typical_size
 from clsplat.formats.streamed_sog import LeafLimits, build_tree, half_boxes, write_lod
 from clsplat.formats.table import detect, model_bytes, read, write
 from clsplat.gaussians.conversion import convert
@@ -34,7 +34,7 @@ def levels(rng: np.random.Generator, counts: tuple[int, ...] = (700, 300, 100)) 
 @pytest.fixture
 def written(tmp_path: Path, rng: np.random.Generator) -> tuple[Path, list[SplatFile]]:
     made = levels(rng)
-    write_lod(tmp_path / "site", made, Writing(quality="high"), SMALL)
+    write_lod(tmp_path / "site", made, WriteOptions(quality="high"), SMALL)
     return tmp_path / "site", made
 
 
@@ -128,7 +128,7 @@ def test_boxes_match_splat_transform(tmp_path):
 
 def test_same_levels_give_the_same_bytes(written, tmp_path, rng):
     folder, made = written
-    assert write_lod(tmp_path / "again", made, Writing(quality="high"), SMALL)
+    assert write_lod(tmp_path / "again", made, WriteOptions(quality="high"), SMALL)
     files = {file.relative_to(folder): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
     again = {p.relative_to(tmp_path / "again"): p.read_bytes() for p in (tmp_path / "again").rglob("*") if p.is_file()}
     assert files == again

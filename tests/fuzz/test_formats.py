@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clsplat.formats.splats import Reading
+from clsplat.formats.splats import ReadOptions
 from clsplat.formats.streamed_sog import LeafLimits, write_lod
 from clsplat.formats.table import CODECS, detect, model_bytes, read, write
 from clsplat.gaussians.validate import examine
@@ -81,7 +81,7 @@ def reads_or_refuses(path: Path) -> None:
         model = outcome(read, path)
         outcome(detect, path)
         outcome(examine, path)
-        kept = outcome(read, path, Reading(not_finite="keep"))
+        kept = outcome(read, path, ReadOptions(not_finite="keep"))
     if model is not None:
         assert kept is not None
         assert all(np.isfinite(table).all() for table in model.parameters.values())

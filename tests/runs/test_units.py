@@ -12,7 +12,7 @@ from clsplat import FieldModel, FieldRenderer, load_field
 from clsplat import run as run_pipeline
 from clsplat.api.commands import evaluate
 from clsplat.core.errors import DataError
-from clsplat.formats.splats import SplatFile, Writing
+from clsplat.formats.splats import SplatFile, WriteOptions
 from clsplat.formats.table import write
 from clsplat.gaussians.model import Model, Rendering, load
 from clsplat.nerf.shape import FieldShape
@@ -175,7 +175,7 @@ def test_files_hold_positions_in_small_units(rng, tmp_path, name):
     parameters = splats(rng, 200).parameters
     means, log_scales = parameters["means"] * np.float32(1e-4), parameters["log_scales"] + np.float32(np.log(1e-4))
     source = SplatFile({**parameters, "means": means, "log_scales": log_scales}, {}, "default")
-    write(tmp_path / name, source, Writing(quiet=True))
+    write(tmp_path / name, source, WriteOptions(quiet=True))
     distances = np.linalg.norm(means[:, None] - load(tmp_path / name).means, axis=2).min(axis=1)
     assert distances.max() < 5e-6
 

@@ -11,7 +11,7 @@ import pytest
 import clsplat
 from clsplat.conformance.scenes import Case
 from clsplat.formats.splat import HEADER, SECTION
-from clsplat.formats.splats import PARAMETERS, Reading, SplatFile, Writing, opacities, unit
+from clsplat.formats.splats import PARAMETERS, ReadOptions, SplatFile, WriteOptions, opacities, unit
 from clsplat.formats.table import read, write
 from clsplat.gaussians.model import Model, Rendering
 from tests.support.data_sets import data_set
@@ -54,7 +54,7 @@ def splats(rng: np.random.Generator, count: int = 600, degree: int = 3, mode: st
 
 
 def round_trip(
-    path: Path, source: SplatFile, options: Writing | None = None, reading: Reading | None = None
+    path: Path, source: SplatFile, options: WriteOptions | None = None, reading: ReadOptions | None = None
 ) -> SplatFile:
     """Write a model and read it."""
     write(path, source, options)

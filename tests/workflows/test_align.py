@@ -212,7 +212,7 @@ def test_bare_model_is_leveled_by_its_ground(tmp_path):
         ("point,x\n", {"control": "c"}, "has no column y"),
         (HEADER + "a,1,2,x,00.png,1,2\n", {"control": "c"}, "c.csv:2: z is 'x'; expected a number"),
         (HEADER + "a,1,2,3,00.png,,2\n", {"control": "c"}, "c.csv:2: u is ''"),
-        (HEADER + "a,1,2,3,00.png,1,2\na,1,2,4,01.png,1,2\n", {"control": "c"}, "has other coordinates above"),
+        (HEADER + "a,1,2,3,00.png,1,2\na,1,2,4,01.png,1,2\n", {"control": "c"}, "other coordinates in an earlier row"),
         (HEADER + "a,,,,00.png,1,2\n", {"control": "c"}, "no point has x, y, and z"),
         (
             HEADER + "a,1,2,3,00.png,30,20\na,,,,05.png,30,20\n",
