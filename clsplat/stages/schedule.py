@@ -76,7 +76,7 @@ class AverageParameters(Scheduled):
     While learning rates are large, the parameters oscillate around a better model, which their average approaches.
     Training continues from the parameters; the average replaces them after the last step.  A new Gaussian is averaged
     from its creation on.  Edits of existing Gaussians, such as a reset of opacities, are averaged with the earlier
-    values; set `start` to a later step.
+    values, so set `start` to a step after these edits.
     """
 
     stage: Literal["average"] = "average"

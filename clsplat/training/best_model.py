@@ -12,7 +12,7 @@ from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel
 from clsplat.gaussians.model import WIDTHS
 
 FOLDER = "best/"  # prefix of its tables in a checkpoint
-OVERFIT_GAP = 6.0  # dB, between the PSNR of training views and other views (ours)
+OVERFIT_GAP = 6.0  # dB, between the PSNR of training views and other views (our choice)
 Tables = dict[str, NDArray[np.float32]]
 Count = Annotated[int, Field(ge=0)]
 

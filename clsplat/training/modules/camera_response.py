@@ -48,8 +48,8 @@ class CameraResponse(TrainingModule):
     rate: NonNegative = 1e-3
     """Learning rate (Adam) of the parameters; may be scheduled. Runs of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It leaves what all photos
-    have in common to the Gaussians."""
+    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It leaves the response
+    that all photos share to the Gaussians."""
 
     def create_state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)

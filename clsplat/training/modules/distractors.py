@@ -32,7 +32,7 @@ WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base"
 NEAR = 0.2  # depth of the near plane, in initial depths
 SIZE, OPACITY = 0.5, 0.05  # initial standard deviation, relative to the spacing of the Gaussians; initial opacity
 GOLDEN = (5**0.5 - 1) / 2
-# A short run visits each photograph only a few dozen times, so rates are larger than those of the scene (ours).
+# A short run visits each photograph only a few dozen times, so rates are larger than those of the scene (our choice).
 RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_base=2e-2, sh_rest=0.0).at(0, 1.0)
 
 
