@@ -141,8 +141,8 @@ class Gltf:
         position = self.tree["accessors"][_index(attributes["POSITION"])] if "POSITION" in attributes else {}
         if len(splats) and {"min", "max"} <= position.keys():
             bounds = [part["means"].min(axis=0), part["means"].max(axis=0)]
-            declared = np.array([position["min"], position["max"]], np.float64)
-            axes.sort(key=lambda signs: float(np.abs(np.sort(bounds * np.array(signs), axis=0) - declared).sum()))
+            target = np.array([position["min"], position["max"]], np.float64)
+            axes.sort(key=lambda signs: float(np.abs(np.sort(bounds * np.array(signs), axis=0) - target).sum()))
         return flip_axes(part, axes[0])
 
     def _read_attributes(self, attributes: dict[str, Any]) -> Parameters:

@@ -32,12 +32,12 @@ def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
     return largest_index, flipped_quats[rows[:, None], _SMALLEST[largest_index]]
 
 
-def from_smallest_three(largest_index: NDArray[np.integer], smallest: NDArray[np.floating]) -> NDArray[np.float32]:
+def from_smallest_three(largest_index: NDArray[np.integer], components: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return unit quaternions [N, 4] from the result of `smallest_three`."""
-    quats = np.empty((len(smallest), 4))
-    rows = np.arange(len(smallest))
-    quats[rows[:, None], _SMALLEST[largest_index]] = smallest
-    quats[rows, largest_index] = np.sqrt(np.maximum(1 - np.square(smallest).sum(axis=1), 0))
+    quats = np.empty((len(components), 4))
+    rows = np.arange(len(components))
+    quats[rows[:, None], _SMALLEST[largest_index]] = components
+    quats[rows, largest_index] = np.sqrt(np.maximum(1 - np.square(components).sum(axis=1), 0))
     return quats.astype(np.float32)
 
 

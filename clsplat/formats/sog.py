@@ -344,8 +344,8 @@ def write_sog(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     """
     require_gaussians(path, splats)
     require_in_range(path, splats, "SOG")
-    ordered = splats.rows(morton_order(splats.parameters["means"]))
-    return write_ordered_sog(path, ordered, log_weights(ordered.parameters, ordered.has_sky), options)
+    sorted_splats = splats.rows(morton_order(splats.parameters["means"]))
+    return write_ordered_sog(path, sorted_splats, log_weights(sorted_splats.parameters, sorted_splats.has_sky), options)
 
 
 def write_ordered_sog(path: Path, splats: SplatFile, weights: NDArray[np.float64], options: WriteOptions) -> str:

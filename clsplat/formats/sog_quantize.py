@@ -198,11 +198,11 @@ def _to_euclidean(rest: NDArray[np.float32], form: NDArray[np.float64]) -> NDArr
     """Transform SH, [N, 3 K], so that squared Euclidean distances equal errors in the metric `form`, [K, K]."""
     count = len(form)
     root = np.linalg.cholesky(form).astype(np.float32)  # e^T G e = |root^T e|^2
-    table, transformed = rest.reshape(len(rest), count, 3), np.zeros((len(rest), count, 3), np.float32)
+    table, result = rest.reshape(len(rest), count, 3), np.zeros((len(rest), count, 3), np.float32)
     for row in range(count):
         for column in range(row + 1):
-            transformed[:, column] += root[row, column] * table[:, row]
-    return transformed.reshape(rest.shape)
+            result[:, column] += root[row, column] * table[:, row]
+    return result.reshape(rest.shape)
 
 
 def _split_clusters(points: NDArray[np.float32], weights: NDArray[np.float64], max_clusters: int) -> Labels:
@@ -284,9 +284,9 @@ def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
 
 def is_before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return a mask, [N], of the distances below the gap that separates a sky.  Without a gap, all are below."""
-    ordered, count = np.sort(distances), len(distances)
+    sorted_distances, count = np.sort(distances), len(distances)
     counts = np.arange(1, count + 1)
-    near_counts = np.searchsorted(ordered, ordered / GAP, side="right")
+    near_counts = np.searchsorted(sorted_distances, sorted_distances / GAP, side="right")
     has_gap = (near_counts >= INSIDE * counts) & (counts >= MIN_INSIDE * count) & (count - counts >= MIN_BEHIND * count)
-    has_gap &= ordered > 0
-    return distances <= ordered[has_gap][-1] / 2 if has_gap.any() else np.ones(count, np.bool_)
+    has_gap &= sorted_distances > 0
+    return distances <= sorted_distances[has_gap][-1] / 2 if has_gap.any() else np.ones(count, np.bool_)

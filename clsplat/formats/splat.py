@@ -217,8 +217,8 @@ def _decode_section(
 def _bucket_centers(path: Path, data: bytes, start: int, section: SplatSection) -> NDArray[np.float64]:
     """Return the center of each splat's bucket, [count, 3]; full buckets come first, then partial ones."""
     partial = np.frombuffer(data, "<u4", section.partial_buckets, start).astype(np.int64)
-    filled = section.full_buckets * section.bucket_size
-    if filled + int(partial.sum()) < section.count or filled > section.rows:
+    full_count = section.full_buckets * section.bucket_size
+    if full_count + int(partial.sum()) < section.count or full_count > section.rows:
         raise DataError(f"{path}: its buckets have fewer splats than the {section.count} declared; copy the file again")
     counts = np.concatenate([np.full(section.full_buckets, section.bucket_size), np.minimum(partial, section.count)])
     ends = np.minimum(np.cumsum(counts), section.count)

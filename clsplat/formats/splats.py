@@ -172,8 +172,8 @@ def concatenate(parts: Sequence[Parameters]) -> Parameters:
 
 def logits(alpha: Floats) -> NDArray[np.float32]:
     """Convert opacities in [0, 1] to logits.  0 and 1 are replaced with MIN_ALPHA and 1 - MIN_ALPHA."""
-    clipped = np.clip(alpha.astype(np.float64), MIN_ALPHA, 1 - MIN_ALPHA)
-    return np.asarray(np.log(clipped / (1 - clipped)), np.float32)
+    clipped_alpha = np.clip(alpha.astype(np.float64), MIN_ALPHA, 1 - MIN_ALPHA)
+    return np.asarray(np.log(clipped_alpha / (1 - clipped_alpha)), np.float32)
 
 
 def opacities(logit: Floats) -> NDArray[np.float64]:

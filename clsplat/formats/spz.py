@@ -257,11 +257,11 @@ def _round_sh_bands(p: Parameters, sh_steps: NDArray[np.float32]) -> tuple[NDArr
     levels = np.clip(rest, -1, 1) * np.float32(128)
     if sh_steps.max(initial=1) > 1:
         form = visible_form(rest)
-        rounded = np.clip(round_sh(levels, sh_steps, form), -128, 128 - sh_steps[:, None])
-        base = compensate_base(p["sh_base"], rest - rounded / 128, form)
+        rounded_sh = np.clip(round_sh(levels, sh_steps, form), -128, 128 - sh_steps[:, None])
+        base = compensate_base(p["sh_base"], rest - rounded_sh / 128, form)
     else:
-        rounded, base = np.rint(levels), p["sh_base"]
-    return np.asarray(np.clip(rounded + 128, 0, 255), np.uint8), base
+        rounded_sh, base = np.rint(levels), p["sh_base"]
+    return np.asarray(np.clip(rounded_sh + 128, 0, 255), np.uint8), base
 
 
 # Zstandard comes from Python 3.14 or newer, or else from the optional package zstandard.
@@ -453,11 +453,11 @@ def _decode_version_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, s
     axes = _read_axes(path, io.BytesIO(data[HEADER4:table_start]).read) if header.flags & EXTENSIONS else ""
     start, frames = table_start + 16 * stream_count, []
     for index, size in enumerate(sizes):
-        length, unpacked = struct.unpack_from("<2Q", data, table_start + 16 * index)
-        if unpacked != size or length > len(data) - start:
+        length, unpacked_size = struct.unpack_from("<2Q", data, table_start + 16 * index)
+        if unpacked_size != size or length > len(data) - start:
             raise DataError(
-                f"{path}: stream {index} declares {length} bytes that decompress to {unpacked}; expected {size} for "
-                f"{header.count} splats, inside the file; copy or export it again"
+                f"{path}: stream {index} declares {length} bytes that decompress to {unpacked_size}; expected {size} "
+                f"for {header.count} splats, inside the file; copy or export it again"
             )
         frames.append(ZstdFrame(path, data[start : start + length], size))
         start += length

@@ -65,8 +65,8 @@ def merge_models(models: Sequence[Model], names: Sequence[str]) -> Model:
         models = [model.baked() for model in models]
     degree = max(model.sh_degree for model in models)
     tables = with_motion([with_degree(model.tables(), degree) for model in models], names)
-    merged: dict[str, Any] = {n: np.concatenate([t[n] for t in tables]) for n in tables[0]}
-    return Model(**merged, rendering=first.rendering, sky=first.sky, origin=origin)
+    merged_tables: dict[str, Any] = {n: np.concatenate([t[n] for t in tables]) for n in tables[0]}
+    return Model(**merged_tables, rendering=first.rendering, sky=first.sky, origin=origin)
 
 
 def _describe_filter(model: Model) -> str:
@@ -146,8 +146,8 @@ def write_model(sources: Sequence[Path], model: Model, out: Path, options: Write
     """Write a model that was read from `sources`, and return the same dictionary as `convert`.  Raises OutputError."""
     size = sum(model_bytes(model_path(source)) for source in sources)
     model.save(out, options)
-    kind = writing_format(out).name
-    return {"file": str(out), "format": kind, "gaussians": len(model), "bytes": model_bytes(out), "bytes_read": size}
+    name = writing_format(out).name
+    return {"file": str(out), "format": name, "gaussians": len(model), "bytes": model_bytes(out), "bytes_read": size}
 
 
 def check_output(sources: Sequence[Path], out: Path) -> None:

@@ -30,8 +30,8 @@ def texel_positions(directions: NDArray[np.floating], side: int) -> Floats:
     directions = np.asarray(directions, np.float64)
     sign = signs(directions)
     negative_z = np.minimum(directions[..., 2:], 0)
-    folded = directions[..., :2] - sign[..., :2] * negative_z
-    square = folded / np.abs(directions).sum(axis=-1, keepdims=True)
+    folded_xy = directions[..., :2] - sign[..., :2] * negative_z
+    square = folded_xy / np.abs(directions).sum(axis=-1, keepdims=True)
     return np.asarray((square + 1) * (side / 2) - 0.5, np.float64)
 
 

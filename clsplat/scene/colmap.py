@@ -408,8 +408,8 @@ def _read_largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
             f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse, or that folder"
         )
     best = max(models, key=lambda model: len(model[1]))
-    if unused := ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0]):
-        logger.info("%s: using the largest model, with %d images; ignoring %s", best[0], len(best[1]), unused)
+    if unused_models := ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0]):
+        logger.info("%s: using the largest model, with %d images; ignoring %s", best[0], len(best[1]), unused_models)
     return best
 
 

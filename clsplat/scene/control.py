@@ -153,8 +153,8 @@ def read_control(path: Path) -> dict[str, MarkedPoint]:
     points: dict[str, MarkedPoint] = {}
     try:
         names = [name.strip().lower() for name in reader.fieldnames or ()]
-        if missing := [name for name in COLUMNS if name not in names]:
-            raise DataError(f"{path}:1: has no column {missing[0]}; expected the header {','.join(COLUMNS)}")
+        if missing_columns := [name for name in COLUMNS if name not in names]:
+            raise DataError(f"{path}:1: has no column {missing_columns[0]}; expected the header {','.join(COLUMNS)}")
         reader.fieldnames = names
         for row in reader:
             source = f"{path}:{reader.line_num}"

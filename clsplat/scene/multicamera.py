@@ -135,10 +135,10 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
             pair = f"{cameras[name].name} and {view.name}"
             raise DataError(f"{path}: {pair} are both poses of camera {name}; expected one pose per camera: remove one")
         cameras[name] = view
-    if missing := sorted(set(frames) - set(cameras)):
+    if missing_names := sorted(set(frames) - set(cameras)):
         raise DataError(
-            f"{path}: {len(missing)} of {len(frames)} cameras have no pose: {first_few(missing)}; expected an image "
-            f"NAME.png of each camera among the poses, or remove {VIDEOS}/{missing[0]}"
+            f"{path}: {len(missing_names)} of {len(frames)} cameras have no pose: {first_few(missing_names)}; "
+            f"expected an image NAME.png of each camera among the poses, or remove {VIDEOS}/{missing_names[0]}"
         )
     if len(views) > len(cameras):
         LOG.info("%s: skipped %d images of cameras without frames in %s", path, len(views) - len(cameras), VIDEOS)

@@ -75,8 +75,8 @@ def near_plane(scene: Scene) -> float:
     It is 4 % of the extent (0.2 for an extent of 5), or half of `near_depth` if that is less.  It is rounded to three
     digits, so that it is the same on every machine.
     """
-    nearest = near_depth(scene)
-    return float(f"{min(NEAR_FRACTION * scene.extent, np.inf if nearest is None else nearest / 2):.3g}")
+    depth = near_depth(scene)
+    return float(f"{min(NEAR_FRACTION * scene.extent, np.inf if depth is None else depth / 2):.3g}")
 
 
 # Sharpness of photographs.

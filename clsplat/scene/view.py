@@ -237,8 +237,8 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
     limit = int(np.iinfo(pixels.dtype).max)
     if is_opaque:
         return np.asarray(np.rint(values * (255 / limit)), np.uint8)
-    unit = values / limit
-    color, alpha = unit[:, :, :3], unit[:, :, 3:]
+    rgba = values / limit
+    color, alpha = rgba[:, :, :3], rgba[:, :, 3:]
     composite = color * alpha + np.asarray(background) * (1 - alpha)
     slack = 1e-3 if is_resized else 0.0  # OpenCV's area weights are single precision: rounding must not lower a level
     return np.asarray(composite * 255 + slack, np.uint8)  # truncated, as in the reference (Kerbl et al. 2023)
@@ -355,8 +355,8 @@ def fits_camera(view: View, size: Size) -> bool:
         return size == (view.lens.width, view.lens.height)
     sides = [*zip(size, (view.camera.width, view.camera.height), strict=True)]
     # a divisor >= 1 must reduce the file's size to the camera's, rounded as in Camera.downscaled
-    smallest = max(1.0, *(side / (c + 0.5) for side, c in sides))
-    return smallest <= min(side / (c - 0.5) if c > 1 else np.inf for side, c in sides)
+    min_divisor = max(1.0, *(side / (c + 0.5) for side, c in sides))
+    return min_divisor <= min(side / (c - 0.5) if c > 1 else np.inf for side, c in sides)
 
 
 # Change the focal length of lenses without changing the undistorted photograph.

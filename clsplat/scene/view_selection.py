@@ -180,10 +180,10 @@ def _path_suffixes(paths: Sequence[PurePosixPath]) -> Iterator[tuple[tuple[str, 
     return ((path.parts[first:], i) for i, path in enumerate(paths) for first in range(len(path.parts)))
 
 
-def _group(indexed: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
+def _group(pairs: Iterable[tuple[tuple[str, ...], int]]) -> dict[tuple[str, ...], list[int]]:
     """Return a dict from each path suffix to the indices of the paths that end with it."""
     groups: dict[tuple[str, ...], list[int]] = {}
-    for parts, i in indexed:
+    for parts, i in pairs:
         groups.setdefault(parts, []).append(i)
     return groups
 
