@@ -29,7 +29,7 @@ void count_step(
         number[i] += 1.0f;
 }
 
-/* Replace values by their averages in rows that have an average. */
+/* Replace values with their averages in rows that have an average. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void take_average(
     __global float *restrict values,         // [components,S]

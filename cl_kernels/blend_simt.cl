@@ -10,8 +10,8 @@
 #define QUADS 3       // of four floats: the part of a splat record that blending reads
 #endif
 
-/* Load a record in aligned quads; in three, the last field is SPLAT_POWER_MIN (or BOX_TURNED, in its place) instead of
- * SPLAT_X_MIN, which blending does not read. */
+/* Load a record in aligned quads.  With three quads, the last field is SPLAT_POWER_MIN (BOX_TURNED with PIXEL_BOX)
+ * instead of SPLAT_X_MIN, which blending does not read. */
 static inline void load_quads(__global const float *splats, const uint splat, float4 *quads)
 {
     __global const float4 *record = (__global const float4 *)splats + (size_t)splat * (RECORD / 4);

@@ -134,7 +134,7 @@ void color_grid_forward(
 }
 
 /* The gradient of the image, through the matrix and through the luminance at which it is interpolated, and the part
- * of the gradient that passes the clamp.  As color_grid_forward. */
+ * of the gradient that passes the clamp.  Groups and memory are as in color_grid_forward. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_backward(
     __global const float *restrict image,     // [channels,H',stride] before the transform

@@ -1,14 +1,14 @@
 /* Density control: sum statistics of each Gaussian, mark rows by rules, and write the new rows.
  *
  * Kerbl et al. 2023, section 5.  A rule is a box in (statistic, size, opacity) with an outcome of three numbers: the
- * rows that a Gaussian becomes (`copies`), how many of them are its old row (`old_rows`), and the factor on the scales
- * of its fresh rows (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  If `shared` is
- * set, the rows together are as opaque as the Gaussian was.  One item = one Gaussian or one row.  No local memory.
- * Deterministic. */
+ * rows that a Gaussian becomes (`copies`), the number of these that keep its moments (`old_rows`), and the factor on
+ * the scales of its fresh rows (`shrink`).  Clone = (2, 1, 1), split in n = (n, 0, 1/1.6), prune = (0, 0, 1).  If
+ * `shared` is set, the rows together are as opaque as the Gaussian was.  One item = one Gaussian or one row.  No local
+ * memory.  Deterministic. */
 #include "random.h"
 #include "splat.h"
 
-/* Count the views that see each Gaussian. */
+/* Count the views in which each Gaussian is visible. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void count_seen(
     __global const float *restrict radius,  // [S] px, 0 = not seen
@@ -20,8 +20,8 @@ void count_seen(
         seen[i] += 1.0f;
 }
 
-/* Add the Euclidean norm of this view's screen gradient, in the unit of Kerbl et al.: loss by normalized device
- * coordinates.  The gradient is in planes `first` and `first` + 1. */
+/* Add the Euclidean norm of this view's screen gradient, in the unit of Kerbl et al.: loss per normalized device
+ * coordinate.  The gradient is in planes `first` and `first` + 1. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void accumulate_norm(
     __global const float *restrict planes,  // [>first+1,S] px^-1
@@ -40,7 +40,7 @@ void accumulate_norm(
     total[i] += sqrt(x * x + y * y);
 }
 
-/* The same with |x| + |y| for the norm. */
+/* The same with |x| + |y| instead of the norm. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void accumulate_sum(
     __global const float *restrict planes,  // [>first+1,S] px^-1

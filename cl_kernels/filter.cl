@@ -48,7 +48,7 @@ void sampling_interval(
     for (uint lane = 0; lane < LANES; lane++)
         lane_max = lanes[lane] > lane_max ? lanes[lane] : lane_max;
     VSTORE(VLOAD_PRIVATE(lanes), interval + i);
-    atomic_max(largest, as_uint(lane_max));  // floats above zero are ordered as their bits
+    atomic_max(largest, as_uint(lane_max));  // positive floats have the order of their bits
 }
 
 /* Convert intervals to variances; Gaussians that no camera sees get the largest interval. */

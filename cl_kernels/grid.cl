@@ -44,7 +44,7 @@ static inline void find_cells(__global const float *places, const uint n, cells_
     const VF part = 1.0f / (TWO_PI * size * size * VLOAD(places + 3 * SAMPLES));
     const VF series = part * (1.0f - part * (0.5f - part / 6.0f));
     const VF weight = sqrt(part < SERIES_MAX ? series : 1.0f - exp_clamped(-part));
-    const VI inside = (x >= 0.0f) & (x <= 1.0f) & (y >= 0.0f) & (y <= 1.0f) & (z >= 0.0f) & (z <= 1.0f);  // no NaN is
+    const VI inside = (x >= 0.0f) & (x <= 1.0f) & (y >= 0.0f) & (y <= 1.0f) & (z >= 0.0f) & (z <= 1.0f);  // not NaN
     VSTORE_PRIVATE((inside ? weight : (VF)(0.0f)), cells->weight);
     cell_along(x, size, cells->x, cells->offset_x);
     cell_along(y, size, cells->y, cells->offset_y);

@@ -4,7 +4,7 @@
  *   M X M^T,  M = 1/2 [1 + u, 1 + v; 1 - u, 1 - v],  (u, v) = sqrt(2) h
  *
  * which is X for Haar's h = (1, -1) / sqrt(2), and the block's mean for h = 0.  Where a block extends beyond the image,
- * it repeats the last row or column.  Masked pixels are replaced by the mean of the other pixels of their block.
+ * it repeats the last row or column.  Masked pixels are replaced with the mean of the other pixels of their block.
  * A block is a float4: upper left, upper right, lower left, lower right.  No local memory.  Deterministic. */
 #include "common.h"
 

@@ -44,7 +44,7 @@ void lay_over(
         row_sums[y] = sum_items(sums);
 }
 
-/* Replace the gradient of the composite by the gradient of the image behind.  One group = one row.  No local memory. */
+/* Replace the gradient of the composite with that of the image behind.  One group = one row.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void look_behind(
     __global const float *restrict transmittance,  // [H',stride] of the layer

@@ -6,7 +6,7 @@
  * No local memory.  Deterministic: the members are summed in the order of their rows, and each value has one writer. */
 #include "common.h"
 
-/* Replace the rows of a cluster by their mean.  One item = one cluster of one plane; dimension 1 is the plane. */
+/* Replace the rows of a cluster with their mean.  One item = one cluster of one plane; dimension 1 is the plane. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void share_mean(
     __global float *restrict values,        // [components,S]

@@ -80,7 +80,7 @@ typedef struct {
     VF inverse, spread; // 1 / e, px^-1; w / (2 e)
 } line_t;
 
-/* Derivatives of ln alpha on these lines; of a parameter they are base + by_z shift_by + R r_by with the pixel's
+/* Derivatives of ln alpha on these lines: with respect to a parameter, base + by_z shift_by + R r_by with the pixel's
  * R = fixed + by_h wide + by_size narrow. */
 typedef struct {
     VF base_long, shift_long, r_long;  // with respect to the mean along the larger variance, px^-1
@@ -158,7 +158,7 @@ static inline void line_of(const float *splat, const VF center, line_t *line, sl
         y = wide_within(dy, s);
     else
         y = sharp_within(dy, s, f);
-    const float k2 = 12.0f * k * k, t2 = t * t;  // t2 apart: sums of two products may be contracted either way
+    const float k2 = 12.0f * k * k, t2 = t * t;  // t2 apart: compilers may contract a sum of two products either way
     const VF r = k2 * y.variance, w2 = sqrt(1.0f + r * r), w = sqrt(w2);
     const VF e = sqrt(t2 + (1.0f + r - w2) * (1.0f / 12.0f)), inverse = 1.0f / e;
     line->scale = splat[SPLAT_OPACITY] * (TWO_PI * s * t) * f.value / w;

@@ -1,5 +1,5 @@
 /* Rows of planes [channels,H',W'], with H', W' whole tiles and zero outside the image; a work-group of TEAM items
- * computes one row.  These functions tell which columns are in the image, and sum over the items. */
+ * computes one row.  These functions test whether columns are in the image, and sum over the items. */
 #ifndef CLSPLAT_PLANES_H
 #define CLSPLAT_PLANES_H
 #include "lanes.h"

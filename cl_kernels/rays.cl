@@ -6,8 +6,8 @@
  *   fine    edges at even values of the distribution of the blurred coarse weights (equation 18, alpha 0.01),
  *           w'_k = (max(w_k-1, w_k) + max(w_k, w_k+1)) / 2 + alpha
  *
- * One item = one ray; items beyond `rays` repeat the last ray, to fill a tile of samples.  Random numbers are counters
- * of (seed, step, ray, edges of four).  No local memory. */
+ * One item = one ray; items beyond `rays` repeat the last ray, to fill a tile of samples.  Random numbers depend
+ * only on (seed, step, ray, block of four edges).  No local memory. */
 #include "lanes.h"
 #include "random.h"
 

@@ -43,7 +43,7 @@ void scan_blocks(
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void scan_offsets(
     __global const uint *restrict values,     // [count]
-    __global const uint *restrict block_sum,  // [blocks] sums of the blocks; not read where there is one
+    __global const uint *restrict block_sum,  // [blocks] sums of the blocks; not read if there is one block
     __global uint *restrict offset,           // [count+1]
     const uint run,
     const uint count)

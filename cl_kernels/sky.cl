@@ -107,7 +107,7 @@ void sky_forward(
 }
 
 /* Whether the photograph shows the map's color, 1 or 0: the mean difference of the channels is small, and all four
- * texels are learned.  As sky_forward. */
+ * texels are learned.  Items and memory are as in sky_forward. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sky_matches(
     __global const uint *restrict runs,         // [R,RUN_WORDS]
@@ -116,7 +116,7 @@ void sky_matches(
     __global const float *restrict free,        // [side * side] 1 for learned texels, else 0
     __constant camera_t *restrict camera,       // [1]
     __global const float *restrict photograph,  // [3,H',stride]
-    __global float *restrict matches,           // [H' + 2,stride + 2 BORDER] all zero before
+    __global float *restrict matches,           // [H' + 2,stride + 2 BORDER] initially zero
     const float difference,                     // up to which a pixel matches
     const float half_side,                      // side / 2
     const uint map_plane,                       // side * side

@@ -17,7 +17,7 @@ void measure_residuals(
     __global const float *restrict photograph,  // [3,H',stride]
     __global const float *restrict mask,        // [H',stride] 0 or 1; read where `masked`
     __global float *restrict residuals,         // [H',stride]
-    __global uint *restrict numbers,            // [BINS], 0 before
+    __global uint *restrict numbers,            // [BINS] initially zero
     const uint masked,
     const uint width,
     const uint height,
@@ -46,8 +46,8 @@ void measure_residuals(
             atomic_add(numbers + k, row_counts[k]);
 }
 
-/* 1 in pixels whose residual is below a threshold, or around which a box has at least as many residuals below it as
- * not; else 0.  One item = one pixel; dimension 1 is the row. */
+/* 1 in pixels whose residual is below a threshold, or around which at least 50 % of the residuals in a box are below
+ * it; else 0.  One item = one pixel; dimension 1 is the row. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mask_transients(
     __global const float *restrict residuals,  // [H',stride]

@@ -38,8 +38,8 @@ class Deviation:
         """The deviation as a sentence."""
         if self.counts:
             count = "1 wrong value" if self.value == 1 else f"{self.value:g} wrong values"
-            return f"{self.kernel} gives {count} in {self.label}" + (f", bound {self.bound:g}" if self.bound else "")
-        return f"{self.kernel} differs by {self.value:.1g} in {self.label}, bound {self.bound:.1g}"
+            return f"{self.kernel} gives {count} in {self.label}" + (f" (at most {self.bound:g})" if self.bound else "")
+        return f"{self.kernel} differs by {self.value:.1g} in {self.label} (at most {self.bound:.1g})"
 
 
 def relative_error(value: NDArray[Any], expected: NDArray[Any]) -> float:
@@ -68,9 +68,9 @@ def match(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any] |
     return count_true(kernel, label, value != expected)
 
 
-def count_true(kernel: str, label: str, mask: NDArray[Any], allowed: float = 0) -> Deviation:
-    """Count the True values of a mask; up to `allowed` pass."""
-    return Deviation(kernel, label, float(np.count_nonzero(mask)), allowed, counts=True)
+def count_true(kernel: str, label: str, mask: NDArray[Any], limit: float = 0) -> Deviation:
+    """Count the True values of a mask; up to `limit` pass."""
+    return Deviation(kernel, label, float(np.count_nonzero(mask)), limit, counts=True)
 
 
 def check_image(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any]) -> Iterator[Deviation]:
@@ -93,7 +93,7 @@ class Note:
 
 
 Results = Iterator[Deviation | Note]
-Run = Callable[[Device, np.random.Generator], Results]
+CheckFunction = Callable[[Device, np.random.Generator], Results]
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Check:
 
     name: str
     kernels: tuple[str, ...]
-    run: Run
+    run: CheckFunction
 
     def deviations(self, device: Device) -> Results:
         """Run the check on a device and yield its results.  The random numbers depend only on the check's name."""
@@ -115,13 +115,13 @@ class Checks:
 
     checks: list[Check] = field(default_factory=list)
 
-    def add(self, *kernels: str) -> Callable[[Run], Run]:
+    def add(self, *kernels: str) -> Callable[[CheckFunction], CheckFunction]:
         """Return a decorator that adds a function as a check of `kernels`.
 
         The name of the check is the name of the function, with spaces instead of underscores.
         """
 
-        def register(run: Run) -> Run:
+        def register(run: CheckFunction) -> CheckFunction:
             self.checks.append(Check(getattr(run, "__name__", "check").replace("_", " "), kernels, run))
             return run
 

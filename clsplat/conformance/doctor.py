@@ -24,7 +24,7 @@ from clsplat.opencl.discovery import DeviceInfo, choose_device, resolve_schedule
 from clsplat.opencl.kernel_caches import kernel_caches
 
 BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # kernels that `rasterizer.sort: radix` does not use
-REPORT = "report it with the file of `clsplat doctor --html FILE`"
+REPORT = "report the failure, and attach the page that `clsplat doctor --html FILE` writes"
 REMEDY = f"update the device's driver or use another device (`clsplat devices` lists them), and {REPORT}"
 
 
@@ -48,8 +48,8 @@ def judge(default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Se
     """
     verdict = _judge_failures(default, schedules, once)
     if verdict.usable and any(result.damaged_cache for results in (*schedules.values(), once) for result in results):
-        advice = f"remove {kernel_caches()}, which fill again" + (f"; {verdict.advice}" if verdict.advice else "")
-        return Verdict(True, f"{verdict.text}, after removing its damaged cache of built kernels", advice)
+        advice = f"remove {kernel_caches()}, and try again" + (f"; {verdict.advice}" if verdict.advice else "")
+        return Verdict(True, f"{verdict.text}; its cache of built kernels is damaged", advice)
     return verdict
 
 
@@ -76,7 +76,7 @@ def _judge_default(failures: Mapping[str, list[str]], other_failures: list[str])
     faults = [f"with the {name} schedule, {texts[0]}" for name, texts in failures.items() if texts] + other_failures
     if not faults:
         return Verdict(True, "use it")
-    return Verdict(True, f"use it as it is; but {faults[0]}", f"training is not affected; {REPORT}")
+    return Verdict(True, f"use it; a failure does not affect training: {faults[0]}", REPORT)
 
 
 def _is_bitonic(result: CheckResult) -> bool:
@@ -166,12 +166,12 @@ class DeviceReport:
         ratio, peaks = note["step"] / sum(note["floors"].values()), note["peaks"]
         return (
             f"{note['step']:.1f} ms per step with {count:,} Gaussians at {width} x {height} px, {ratio:.1f} times the "
-            f"minimum at {peaks['gflops']:.0f} GFLOP/s and {peaks['gbytes']:.1f} GB/s"
+            f"minimum for {peaks['gflops']:.0f} GFLOP/s and {peaks['gbytes']:.1f} GB/s"
         )
 
 
 def summary(results: list[CheckResult]) -> str:
-    """Return the number of checks, comparisons and failures, as a sentence."""
+    """Return the number of checks, comparisons, and failures, as a sentence."""
     deviations = [deviation for result in results for deviation in result.deviations]
     failure_count = sum(not deviation.passes for deviation in deviations)
     fault_count = sum(result.fault is not None for result in results)
@@ -216,14 +216,14 @@ def examine(device: str | Device | None = None) -> DeviceReport:
         results = report.schedules[schedule] = []
         for result in run_checks(info, schedule, KERNELS):
             results.append(result)
-            LOG.info("%s", progress(schedule, result))
+            LOG.info("%s", progress_line(schedule, result))
         if all(result.passes and not result.damaged_cache for result in results):
             remember(info, schedule)
         else:
             forget(info, schedule)
     for result in run_checks(info, default, SPEED):
         report.once.append(result)
-        LOG.info("%s", progress("", result))
+        LOG.info("%s", progress_line("", result))
     report.seconds = time.perf_counter() - start_time
     return report
 
@@ -238,7 +238,7 @@ def _is_due(schedule: str, report: DeviceReport) -> bool:
     return report.info.kind == "CPU" and bool(report.failures["simt"])
 
 
-def progress(schedule: str, result: CheckResult) -> str:
+def progress_line(schedule: str, result: CheckResult) -> str:
     """Return the log line of one check."""
     failures = result.failures
     count = len(result.deviations)
@@ -294,17 +294,17 @@ def _facts(report: DeviceReport) -> dict[str, str]:
     info, host = report.info, system()
     training = report.note("training")
     facts = {
-        "device": f"{info.name}, {info.kind}, {info.units} units",
+        "device": f"{info.name}, {info.kind}, {info.units} compute units",
         "runtime": info.platform,
         "driver": info.driver,
-        "limits": f"{info.memory / GIB:.1f} GiB, buffers up to {info.allocation / GIB:.1f} GiB, groups up to "
-        f"{info.group}, {info.local_memory >> 10} KiB local, {info.float_width} lanes",
+        "limits": f"{info.memory / GIB:.1f} GiB, buffers up to {info.allocation / GIB:.1f} GiB, work-groups up to "
+        f"{info.group}, {info.local_memory >> 10} KiB of local memory, vectors of {info.float_width} floats",
         "default schedule": report.default,
         "memory": report.memory(),
         "clsplat": host["clsplat"],
         "system": f"{host['system']}, {host['processors']} processors",
         "Python": f"{host['python']}, NumPy {host['numpy']}",
-        "environment": ", ".join(f"{name}={value}" for name, value in host["environment"].items()) or "nothing set",
+        "environment": ", ".join(f"{name}={value}" for name, value in host["environment"].items()) or "none set",
         "duration": duration_text(report.seconds),
     }
     if training:
@@ -316,12 +316,12 @@ def _facts(report: DeviceReport) -> dict[str, str]:
 
 def largest_error(result: CheckResult) -> str:
     """Return the largest deviation relative to its bound, as text."""
-    largest = max(result.deviations, key=_bound_ratio, default=None)
-    if largest is None:
+    worst = max(result.deviations, key=_bound_ratio, default=None)
+    if worst is None:
         return ""
-    if largest.counts:
-        return "exact" if largest.value == 0 else f"{largest.value:g} wrong"
-    return f"{100 * largest.value / largest.bound:.0f} %"
+    if worst.counts:
+        return "exact" if worst.value == 0 else f"{worst.value:g} wrong"
+    return f"{100 * worst.value / worst.bound:.0f} %"
 
 
 def _bound_ratio(deviation: Deviation) -> float:

@@ -45,14 +45,14 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     if it has too little memory.
     """
     info, schedule = device.info, device.schedule
-    bitonic = resolve_sort(device, sort) != "radix"
-    sorts = SORTS if bitonic else SORTS[:1]
+    uses_bitonic = resolve_sort(device, sort) != "radix"
+    sorts = SORTS if uses_bitonic else SORTS[:1]
     if all(_record_file(info, schedule, name).exists() for name in sorts):
         return
     from clsplat.conformance.checks import BITONIC, ESSENTIAL  # slow to import, and not needed for a verified device
 
     LOG.info("checking %s; this takes a few seconds, or longer if its compiler is slow", info.name)
-    for result in run_checks(info, schedule, [*ESSENTIAL, *(BITONIC if bitonic else [])], TIMEOUT_S):
+    for result in run_checks(info, schedule, [*ESSENTIAL, *(BITONIC if uses_bitonic else [])], TIMEOUT_S):
         if result.out_of_memory:
             raise MemoryLimitError(f"{device.text}: {result.failures[0]}; close other programs that use its memory")
         if result.damaged_cache:
@@ -96,8 +96,8 @@ def _hash_kernels() -> str:
 
 @cache
 def _hash_checks() -> str:
-    here = Path(__file__).parent
-    return _hash_files(path for folder in ("checks", "reference") for path in (here / folder).glob("*.py"))
+    parent = Path(__file__).parent
+    return _hash_files(path for folder in ("checks", "reference") for path in (parent / folder).glob("*.py"))
 
 
 def _hash_files(files: Iterable[Path]) -> str:

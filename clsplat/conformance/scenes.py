@@ -18,7 +18,7 @@ from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
 SHARP = ref.Thresholds()
-EYE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.09, 0.977, 0.3]])
+POSE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.09, 0.977, 0.3]])
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,10 @@ def random_case(rng: np.random.Generator, count: int, width: int = 40, height: i
     focal = 0.9 * width
     depth = rng.uniform(1.5, 6, count)
     offsets = rng.uniform(-0.65, 0.65, (count, 2)) * [width / focal, height / focal]
-    in_camera = np.stack([offsets[:, 0] * depth, offsets[:, 1] * depth, depth], axis=1)
-    rotation, translation = _orthogonal(EYE[:, :3]), EYE[:, 3]
+    camera_points = np.stack([offsets[:, 0] * depth, offsets[:, 1] * depth, depth], axis=1)
+    rotation, translation = _orthogonal(POSE[:, :3]), POSE[:, 3]
     parameters = {
-        "means": (in_camera - translation) @ rotation,
+        "means": (camera_points - translation) @ rotation,
         "quats": rng.normal(size=(count, 4)) * rng.uniform(0.3, 3, (count, 1)),
         "log_scales": np.log(3 / focal * depth[:, None]) + rng.normal(-0.3, 0.6, (count, 3)),
         "logit_opacity": rng.normal(0.5, 1.5, (count, 1)),

@@ -56,7 +56,7 @@ def _run(out: TextIO, check: Check, open_once: Callable[[], Device]) -> None:
 
 def _fault_source(error: Exception) -> str:
     if type(error).__module__.startswith("pyopencl"):
-        return "the OpenCL runtime refuses a call"
+        return "the OpenCL runtime rejects a call"
     return f"the check raises {type(error).__name__}, which may be a bug in clsplat"
 
 

@@ -68,7 +68,7 @@ def apply_edit(edit: Edit, tiler: Tiler) -> None:
 
 def _set_children(edit: Edit, row_offset: Array) -> None:
     """Write the values that rules set for children, unless a later rule or limit changed the number of children."""
-    copies, first_rows = edit.rows(), row_offset.get()
+    copies, first_rows = edit.row_counts(), row_offset.get()
     for name, sources, values in edit.children:
         is_complete = copies[sources] == values.shape[1]
         rows = first_rows[sources[is_complete], None] + np.arange(values.shape[1])
@@ -119,7 +119,7 @@ class Change:
     before: int
     after: int
     causes: dict[str, int]  # number of Gaussians with an outcome set by a rule, by the rule's name
-    grown: dict[str, int]  # like causes, but only Gaussians that became several
+    growth: dict[str, int]  # like causes, but only Gaussians that became several
 
 
 def densify(
@@ -154,14 +154,14 @@ def mark(edit: Edit, rules: Sequence[Rule], limit: int | None = None, inside: Bo
     active_rules = [(index, rule) for index, rule in enumerate(rules) if edit.step > rule.start]
     rule_index = np.full(old_count, -1)
     for edit.rule, rule in active_rules:
-        rows = edit.rows()
+        rows = edit.row_counts()
         rule.mark(edit)
-        rule_index[edit.rows() != rows] = edit.rule
+        rule_index[edit.row_counts() != rows] = edit.rule
     if inside is not None:
         edit.undo_growth(~inside.contains(gaussians.get("means")))
-    if limit is not None and int(edit.rows().sum(dtype=np.int64)) > limit:
+    if limit is not None and int(edit.row_counts().sum(dtype=np.int64)) > limit:
         edit.limit(limit)
-    rows = edit.rows()
+    rows = edit.row_counts()
     rule_index[rows == 1] = -1
     causes: dict[str, int] = {}
     growth_counts: dict[str, int] = {}

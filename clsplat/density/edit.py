@@ -202,18 +202,18 @@ class Edit:
         names = [table for parameter in parameter_names for table in moment_tables(parameter)]
         self.gaussians.zero_rows([name for name in names if name in self.gaussians.tables], rows)
 
-    def rows(self) -> NDArray[np.uint32]:
+    def row_counts(self) -> NDArray[np.uint32]:
         """Return the number of rows that each Gaussian becomes, [N]."""
         return self.copies.get()
 
     @property
     def room(self) -> int | None:
         """The number of rows that rules may still add, negative above the limit; None if there is no limit."""
-        return None if self.max_rows is None else self.max_rows - int(self.rows().sum(dtype=np.int64))
+        return None if self.max_rows is None else self.max_rows - int(self.row_counts().sum(dtype=np.int64))
 
     def undo_growth(self, mask: NDArray[np.bool_]) -> None:
         """Undo the growth of the Gaussians in a mask, [N], so that the edit does not change them."""
-        mask = mask & (self.rows() > 1)
+        mask = mask & (self.row_counts() > 1)
         for array, unchanged_value in zip(self._outcome.values(), (1, 1, 1, 0), strict=True):
             array.set(np.where(mask, unchanged_value, array.get()))
 
@@ -222,7 +222,7 @@ class Edit:
 
         Gaussians with the smallest means of the first scalar statistic are undone first.
         """
-        rows = self.rows().astype(np.int64)
+        rows = self.row_counts().astype(np.int64)
         growing_rows = np.flatnonzero(rows > 1)
         scalars = [name for name, column in self.stats.columns.items() if column.components == 1]
         score = self.stats.mean(scalars[0]) if scalars else np.zeros(len(rows), np.float32)

@@ -36,14 +36,14 @@ class Comparison:
     depths: KnownDepths | None = None  # at pixels of the photograph, if a loss reads them
 
     @property
-    def value_count(self) -> int:
+    def size(self) -> int:
         """The number of values in the image."""
         return 3 * self.camera.width * self.camera.height
 
     @property
-    def unmasked_value_count(self) -> int:
+    def unmasked_size(self) -> int:
         """The number of values in unmasked pixels; waits for the device if there is a mask."""
-        return self.value_count if self.mask is None else 3 * int(self.mask.get().sum())
+        return self.size if self.mask is None else 3 * int(self.mask.get().sum())
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,7 @@ class L1(ImageLoss):
     def add(self, comparison: Comparison) -> LossValue:
         weight = at_step(self.weight, comparison.step)
         sums = pixel_loss(comparison, l1=weight, l2=0.0)
-        return LossValue(
-            "l1", lambda: weight * float(sums.get()[..., 0].sum(dtype=np.float64)) / comparison.value_count
-        )
+        return LossValue("l1", lambda: weight * float(sums.get()[..., 0].sum(dtype=np.float64)) / comparison.size)
 
 
 class L2(ImageLoss):
@@ -39,9 +37,7 @@ class L2(ImageLoss):
     def add(self, comparison: Comparison) -> LossValue:
         weight = at_step(self.weight, comparison.step)
         sums = pixel_loss(comparison, l1=0.0, l2=weight)
-        return LossValue(
-            "l2", lambda: weight * float(sums.get()[..., 1].sum(dtype=np.float64)) / comparison.value_count
-        )
+        return LossValue("l2", lambda: weight * float(sums.get()[..., 1].sum(dtype=np.float64)) / comparison.size)
 
 
 class Dssim(ImageLoss):
@@ -60,19 +56,17 @@ class Dssim(ImageLoss):
             image=comparison.image,
             photograph=comparison.photograph,
             gradient=comparison.gradient,
-            scale=-weight / comparison.value_count,
+            scale=-weight / comparison.size,
             accumulate=int(comparison.accumulate),
             **comparison.camera.plane_arguments(),
         )
         comparison.accumulate = True
-        return LossValue(
-            "dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.value_count)
-        )
+        return LossValue("dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.size))
 
 
 def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
     """Add the gradient of weighted L1 and L2; return the sums of |x - y| and (x - y)² by row, [3, rows, 2]."""
-    camera, value_count = comparison.camera, comparison.value_count
+    camera, size = comparison.camera, comparison.size
     sums = comparison.workspace.array("row_sums", (3, camera.rows, 2))  # identical for all losses of a step
     comparison.workspace.device.program("loss.cl").pixel_loss(
         groups=(1, camera.rows, 3),
@@ -80,8 +74,8 @@ def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
         photograph=comparison.photograph,
         gradient=comparison.gradient,
         row_sums=sums,
-        l1=l1 / value_count,
-        l2=l2 / value_count,
+        l1=l1 / size,
+        l2=l2 / size,
         accumulate=int(comparison.accumulate),
         **comparison.camera.plane_arguments(),
     )
@@ -92,7 +86,7 @@ def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
 def psnr(comparison: Comparison) -> float:
     """Return the PSNR of unmasked pixels, dB, before rounding to 8 bits; waits for the device."""
     squares = pixel_loss(comparison, l1=0.0, l2=0.0).get()[..., 1]
-    error = float(squares.sum(dtype="float64")) / comparison.unmasked_value_count
+    error = float(squares.sum(dtype="float64")) / comparison.unmasked_size
     return -10 * math.log10(max(error, 1e-10))
 
 

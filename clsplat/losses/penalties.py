@@ -37,9 +37,7 @@ class CovarianceTrace(Penalty):
         weight = at_step(self.weight, inputs.step) / max(1, gaussians.count) / inputs.extent**2
         gaussians.device.program("penalty.cl").covariance_trace(
             **inputs.arguments("log_scales"),
-            nearest2=gaussians[INTERVAL2]
-            if self.pixels
-            else gaussians["filter_variance"],  # without `pixels`, the kernel multiplies it by 0
+            nearest2=gaussians[INTERVAL2] if self.pixels else gaussians["filter_variance"],  # or any table: times 0
             sums=sums,
             above=0.0 if self.pixels else self.above * inputs.extent**2,
             pixels2=3.0 * (self.pixels or 0.0) ** 2,

@@ -28,7 +28,7 @@ class PruneInvisible(Rule):
         timestamps = np.unique([view.time or 0.0 for view in edit.survey.views])
         motion = gaussians.get(MOTION)
         centers = motion[:, motion_fields(motion.shape[1])["time_center"]][:, 0]
-        later = np.searchsorted(timestamps, centers).clip(1, max(len(timestamps) - 1, 1))
-        presences = [presence(motion, timestamps[np.minimum(i, len(timestamps) - 1)]) for i in (later - 1, later)]
+        upper = np.searchsorted(timestamps, centers).clip(1, max(len(timestamps) - 1, 1))
+        presences = [presence(motion, timestamps[np.minimum(i, len(timestamps) - 1)]) for i in (upper - 1, upper)]
         opacity = opacities(gaussians.get("logit_opacity")[:, 0]) * np.maximum(*presences)
         edit.choose(opacity < edit.at(self.opacity_below), copies=0, old_rows=0)

@@ -37,7 +37,7 @@ def count_wrong_pixels(survey: Survey, views: int, error_above: float) -> WrongP
     return WrongPixels(total // max(len(sampled_views), 1), normalize(weighted_sum, np.ones(len(weighted_sum), bool)))
 
 
-class ByWrongPixels(Rule):
+class WrongPixelsRule(Rule):
     """Base class of rules that count wrong pixels; rules with the same `views` and `error_above` share the counts."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"views", "error_above"})
@@ -52,7 +52,7 @@ class ByWrongPixels(Rule):
         return edit.survey.compute_once(count_wrong_pixels, self.views, self.error_above)
 
 
-class RevertGrowth(ByWrongPixels):
+class RevertGrowth(WrongPixelsRule):
     """Undo the growth of Gaussians that contribute to few wrong pixels."""
 
     type: Literal["revert_growth"] = "revert_growth"
@@ -65,7 +65,7 @@ class RevertGrowth(ByWrongPixels):
         edit.undo_growth(self.count_wrong_pixels(edit).pixels <= edit.at(self.pixels_above))
 
 
-class PruneSampled(SampledPruning, ByWrongPixels):
+class PruneSampled(SampledPruning, WrongPixelsRule):
     """Remove a fraction of the faint and of the large Gaussians, sampled by 1 / (1 - score).
 
     The score is the number of wrong pixels times the loss of the view, summed over views and scaled to [0, 1].
@@ -78,7 +78,7 @@ class PruneSampled(SampledPruning, ByWrongPixels):
             return np.asarray(1 / (1 - self.count_wrong_pixels(edit).score))
 
 
-class PruneInaccurate(ByWrongPixels):
+class PruneInaccurate(WrongPixelsRule):
     """Remove Gaussians with a large score, as defined for `prune_sampled`."""
 
     type: Literal["prune_inaccurate"] = "prune_inaccurate"

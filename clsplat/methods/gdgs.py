@@ -46,10 +46,8 @@ class CloneDense(Rule):
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
-        means, scales = (
-            gaussians.get("means").astype(np.float64),
-            np.exp(gaussians.get("log_scales").astype(np.float64)),
-        )
+        means = gaussians.get("means").astype(np.float64)
+        scales = np.exp(gaussians.get("log_scales").astype(np.float64))
         has_gradient = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
         cell = grid_cells(means, self.cells)
         counts = np.bincount(cell[has_gradient & (cell >= 0)], minlength=self.cells**3)
@@ -58,7 +56,7 @@ class CloneDense(Rule):
         if counts[densest].sum() < edit.at(self.ratio_above) * max(counts[sparsest].sum(), 1):
             return
         is_small = scales.max(axis=1, initial=0) <= edit.at(self.size_below) * edit.scene_scale.extent
-        is_copied = has_gradient & is_small & np.isin(cell, densest) & (edit.rows() == 1)
+        is_copied = has_gradient & is_small & np.isin(cell, densest) & (edit.row_counts() == 1)
         rows = np.flatnonzero(is_copied)
         quats = gaussians.get("quats")[rows].astype(np.float64)
         axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T) * scales[rows, None, :]

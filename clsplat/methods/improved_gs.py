@@ -68,7 +68,7 @@ class SplitLongAxis(Rule):
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
-        is_split = (edit.stats.mean("screen_grad_abs") >= edit.at(self.gradient_above)) & (edit.rows() == 1)
+        is_split = (edit.stats.mean("screen_grad_abs") >= edit.at(self.gradient_above)) & (edit.row_counts() == 1)
         if edit.room is not None and edit.room < is_split.sum():
             order = sampling_order(is_split, edit.survey.compute_once(edge_scores, self.views), edit.random())
             is_split = np.isin(np.arange(gaussians.count), order[: max(edit.room, 0)])
@@ -104,7 +104,7 @@ class PruneLowestOpacity(Rule):
     """Fraction of the Gaussians that is removed."""
 
     def mark(self, edit: Edit) -> None:
-        logits, is_remaining = edit.gaussians.get("logit_opacity")[:, 0], edit.rows() > 0
+        logits, is_remaining = edit.gaussians.get("logit_opacity")[:, 0], edit.row_counts() > 0
         edit.choose(select_largest(-logits, int(self.share * is_remaining.sum()), is_remaining), copies=0, old_rows=0)
 
 

@@ -32,10 +32,11 @@ class Relocate(Rule):
     """Number of Gaussians after an edit, divided by the number before."""
 
     def mark(self, edit: Edit) -> None:
-        gaussians, rows = edit.gaussians, edit.rows()
+        gaussians, rows = edit.gaussians, edit.row_counts()
         logit, log_scales = (gaussians.get(name).astype(np.float64) for name in ("logit_opacity", "log_scales"))
         opacity = np.minimum(1 / (1 + np.exp(-logit[:, 0])), 1 - 1e-7)
-        is_faint = opacity < edit.at(self.opacity_below)
+        min_opacity = edit.at(self.opacity_below)
+        is_faint = opacity < min_opacity
         weights = np.where(is_faint | (rows != 1), 0, opacity * WEIGHT_STEPS).astype(np.uint64)
         if not weights.any():
             return
@@ -43,9 +44,7 @@ class Relocate(Rule):
         draws = sample_systematically(weights, max(0, int(new_rows) + int(rows[is_faint].sum())), edit.random())
         sources = np.flatnonzero(draws)
         copies = draws[sources] + 1
-        opacities, factors = divide_opacity(
-            opacity[sources], np.minimum(copies, MAX_COPIES), edit.at(self.opacity_below)
-        )
+        opacities, factors = divide_opacity(opacity[sources], np.minimum(copies, MAX_COPIES), min_opacity)
         logits = np.log(opacities / (1 - opacities))[:, None]
         log_scales = log_scales[sources] + np.log(factors)[:, None]
         for number in np.unique(copies):  # set_children has no effect if a later rule or the limit undoes the growth

@@ -70,7 +70,7 @@ class Subdivide(Rule):
 
         Skips Gaussians that are small on the screen or that an earlier rule has selected.
         """
-        candidates = candidates & (edit.rows() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
+        candidates = candidates & (edit.row_counts() == 1) & (edit.stats.mean("screen_radius") >= self.radius_above)
         is_split = select_largest(score, int(self.max_fraction * len(candidates)), candidates)
         edit.choose(is_split, copies=self.children, old_rows=0, shrink=self.beta**0.5)
 
@@ -184,7 +184,7 @@ class MergeNeighbors(Rule):
         names = ("means", "quats", "log_scales", "logit_opacity", "sh_base", "sh_rest")
         tables = {name: gaussians.get(name).astype(np.float64) for name in names}
         first, second = self._pairs(edit, tables)
-        is_unchanged = edit.rows() == 1
+        is_unchanged = edit.row_counts() == 1
         is_usable = is_unchanged[first] & is_unchanged[second]
         first, second = first[is_usable], second[is_usable]
         if not len(first):

@@ -64,8 +64,8 @@ class PruneUseless(Rule):
 
     def mark(self, edit: Edit) -> None:
         weights = edit.survey.compute_once(sampled_weights, self.weight_per_view, self.views)
-        is_needed = select_by_weight(weights.total, self.weight_total) & (weights.views >= self.views_below)
-        edit.choose(~is_needed, copies=0, old_rows=0)
+        is_useful = select_by_weight(weights.total, self.weight_total) & (weights.views >= self.views_below)
+        edit.choose(~is_useful, copies=0, old_rows=0)
 
 
 class HideUseless(Scheduled):

@@ -17,9 +17,9 @@ class OpacityPressure(Penalty):
 
     type: Literal["opacity_pressure"] = "opacity_pressure"
     floor: float = -20.0
-    """Logit at which the pull ends."""
+    """Logit below which an opacity is not lowered."""
     gaussians: Annotated[int, Field(ge=0)] = 0
-    """Number of Gaussians at which the pull ends."""
+    """Number of Gaussians at or below which the penalty is off."""
 
     def add(self, inputs: PenaltyInputs) -> LossValue:
         gaussians, sums = inputs.gaussians, inputs.sums("opacity_pressure")

@@ -80,11 +80,11 @@ class SplitSteepest(Rule):
     def mark(self, edit: Edit) -> None:
         gaussians, extent = edit.gaussians, edit.scene_scale.extent
         has_gradient = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
-        rows = np.flatnonzero(has_gradient & (edit.rows() == 1))
+        rows = np.flatnonzero(has_gradient & (edit.row_counts() == 1))
         values, axes = smallest_eigenvectors(edit.stats.means("splitting")[rows].astype(np.float64) * extent**2)
         room = len(rows) if edit.room is None else max(edit.room, 0)
-        lowest = select_largest(-values, room, values < edit.at(self.eigenvalue_below))
-        rows, axes = rows[lowest], axes[lowest]
+        mask = select_largest(-values, room, values < edit.at(self.eigenvalue_below))
+        rows, axes = rows[mask], axes[mask]
         tables = {
             name: gaussians.get(name)[rows].astype(np.float64)
             for name in ("means", "quats", "log_scales", "logit_opacity")
@@ -101,7 +101,7 @@ class SplitSteepest(Rule):
 
 
 def smallest_eigenvectors(columns: Floats) -> tuple[Floats, Floats]:
-    """Return the smallest eigenvalue of symmetric matrices, [N], and its unit eigenvector, [N, 3], from [N, 6] columns.
+    """Return the smallest eigenvalue of each symmetric matrix, [N], and its unit eigenvector, [N, 3].  columns: [N, 6].
 
     The component of the eigenvector with the largest magnitude is positive.  Rows that are not finite give 0.
     """

@@ -41,10 +41,8 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
         radius = render.radius()
         row = view.world_to_camera[2]
         depth = (render.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # BLAS bits depend on threads
-        sums = (
-            render.sum(BLENDED, pixel_weights(render)),
-            render.sum(BLENDED, np.ones(render.counted_pixels().shape)),
-        )
+        textures = pixel_weights(render), np.ones(render.counted_pixels().shape)
+        sums = [render.sum(BLENDED, texture) for texture in textures]
         values = (5, depth), (10, radius), (10, sums[0]), (0.1, sums[1]), (50, render.sum(WEIGHT))
         loss = render.loss(LOSSES) * (radius > 0)
         losses += loss
@@ -52,7 +50,7 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
     return losses, terms
 
 
-class ByScore(Rule):
+class ScoredRule(Rule):
     """Base class of rules that sample Gaussians by score.  Rules with the same `views` share the scores."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"views"})
@@ -74,7 +72,7 @@ class ByScore(Rule):
         return score
 
 
-class GrowScored(ByScore):
+class GrowScored(ScoredRule):
     """Undo growth by earlier rules that exceeds the limit of the edit (`max_gaussians`, `budget`, memory).
 
     Gaussians that may grow are sampled by score.  Clones and splits share the limit in proportion to their numbers.
@@ -85,7 +83,7 @@ class GrowScored(ByScore):
     def mark(self, edit: Edit) -> None:
         if edit.room is None or edit.room >= 0:
             return
-        rows, is_clone = edit.rows().astype(np.int64), edit.old_rows.get() > 0
+        rows, is_clone = edit.row_counts().astype(np.int64), edit.old_rows.get() > 0
         is_undone = rows > 1
         if not is_undone.any():
             return
@@ -101,7 +99,7 @@ class GrowScored(ByScore):
         edit.undo_growth(is_undone)
 
 
-class PruneScored(SampledPruning, ByScore):
+class PruneScored(SampledPruning, ScoredRule):
     """Remove a fraction of the faint and of the large Gaussians, sampled by 1 / score."""
 
     type: Literal["prune_scored"] = "prune_scored"

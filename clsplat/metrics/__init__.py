@@ -1,4 +1,4 @@
-"""Image metrics of two images: `psnr` and `ssim`.  `clsplat.evaluate` measures a model with them."""
+"""The image metrics `psnr` and `ssim`.  `clsplat.evaluate` measures a model with them."""
 
 from clsplat.metrics.images import psnr, ssim
 

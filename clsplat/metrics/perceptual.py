@@ -47,9 +47,7 @@ class Lpips:
                 "write one with clsplat data lpips"
             ) from error
         if (distance := self.distance(gray, gray)) != 0:
-            raise ConfigError(
-                f"{path}: not an LPIPS network; expected the distance 0 for equal images, got {distance:g}"
-            )
+            raise ConfigError(f"{path}: not an LPIPS network; the distance of equal images is {distance:g}, not 0")
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
         """Return the distance of two images, [height, width, 3].  Raises ConfigError if the network rejects them."""
@@ -66,7 +64,7 @@ class Lpips:
             ) from error
         if output.size != 1 or output.dtype.kind != "f" or not np.isfinite(output).all():
             raise ConfigError(
-                f"{self.path}: expected one finite number for two images, got {output.size} of type {output.dtype}"
+                f"{self.path}: expected one finite float for two images, got {output.ravel()[:4].tolist()}"
             )
         return float(output.ravel()[0])
 

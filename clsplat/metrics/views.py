@@ -100,12 +100,12 @@ class FlickerMeter:
         for camera in self._cameras.values():
             if camera.renders.count < MIN_TIMESTAMPS:
                 continue
-            render, photo = camera.renders.deviation(), camera.photographs.deviation()
-            static = np.ones(render.shape[:2], bool) if camera.static_mask is None else camera.static_mask
+            render_std, photo_std = camera.renders.deviation(), camera.photographs.deviation()
+            static = np.ones(render_std.shape[:2], bool) if camera.static_mask is None else camera.static_mask
             if not camera.has_static_file:
-                static = static & (photo.max(axis=2) <= MAX_NOISE)
+                static = static & (photo_std.max(axis=2) <= MAX_NOISE)
             if static.any():
-                values = {FLICKER: float(render[static].mean()), PHOTO_FLICKER: float(photo[static].mean())}
+                values = {FLICKER: float(render_std[static].mean()), PHOTO_FLICKER: float(photo_std[static].mean())}
                 flicker |= {name: {**values, STATIC_FRACTION: float(static.mean())} for name in camera.views}
         return flicker
 
@@ -161,11 +161,10 @@ def color_metrics(
     mask: [height, width], True for unmasked pixels.  `psnr_color` is missing if a half of the image has too few pixels
     to fit.  NaN in the render counts as black, infinity as white or black.
     """
-    truth = photograph / 255.0
-    finite_image = np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
+    truth, pixels = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     full_mask = np.ones(truth.shape[:2], bool) if mask is None else mask
-    fitted_image = fit_colors(finite_image, photograph, full_mask, color_model)
-    corrected_image = correct_by_regression(finite_image, truth, full_mask)
+    fitted_image = fit_colors(pixels, photograph, full_mask, color_model)
+    corrected_image = correct_by_regression(pixels, truth, full_mask)
     color = {} if fitted_image is None else {"psnr_color": psnr(fitted_image, photograph, full_mask)}
     return {**color, "psnr_affine": psnr(corrected_image, photograph, full_mask)}
 

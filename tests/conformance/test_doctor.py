@@ -43,17 +43,17 @@ VERDICTS = {
         {"wide": result(WRONG), "simt": result(RIGHT)},
         True,
         "use it with --set rasterizer.schedule=simt: with the wide schedule, blend_backward differs by 0.03 in "
-        "gradients of conics, 17 Gaussians, bound 0.0002",
+        "gradients of conics, 17 Gaussians (at most 0.0002)",
     ),
     "the other one is wrong": (
         {"wide": result(RIGHT), "simt": result(WRONG)},
         True,
-        "use it as it is; but with the simt schedule, blend_backward differs by 0.03",
+        "use it; a failure does not affect training: with the simt schedule, blend_backward differs by 0.03",
     ),
     "both are wrong": (
         {"wide": result(WRONG), "simt": result(fault="the runtime crashes with SIGABRT")},
         False,
-        "do not use it: blend_backward differs by 0.03 in gradients of conics, 17 Gaussians, bound 0.0002; "
+        "do not use it: blend_backward differs by 0.03 in gradients of conics, 17 Gaussians (at most 0.0002); "
         "1 more failure",
     ),
     "a sort is wrong": (
@@ -80,7 +80,7 @@ def test_verdict_has_a_remedy(case):
 
 def test_memory_faults_are_reported_although_kernels_pass():
     verdict = judge("wide", {"wide": result(RIGHT)}, result(Deviation("fill_words", "samples", 3, 0, counts=True)))
-    assert verdict.text == "use it as it is; but fill_words gives 3 wrong values in samples"
+    assert verdict.text == "use it; a failure does not affect training: fill_words gives 3 wrong values in samples"
 
 
 def test_checks_continue_after_a_runtime_crashes(monkeypatch, info):
@@ -132,7 +132,7 @@ def test_fault_that_empty_caches_fix_is_a_damaged_cache(monkeypatch, info):
     assert [item.damaged_cache for item in results] == [False, True, False, True, False, False]
     verdict = judge("simt", {"simt": results[:4]}, [])
     assert verdict.usable
-    assert verdict.text == "use it, after removing its damaged cache of built kernels"
+    assert verdict.text == "use it; its cache of built kernels is damaged"
     assert re.search("remove .*pyopencl", verdict.advice)
     assert not judge("simt", {"simt": results}, []).usable
 
@@ -262,7 +262,9 @@ def test_memory_held_by_other_programs_is_no_device_fault(monkeypatch, largest, 
 def test_wrong_values_in_a_large_buffer_are_a_fault(monkeypatch, largest):
     failures, report = memory_of(monkeypatch, largest, Deviation("fill_words", "samples", 3, 0, counts=True))
     assert failures
-    assert report.verdict.text == "use it as it is; but fill_words gives 3 wrong values in samples"
+    assert (
+        report.verdict.text == "use it; a failure does not affect training: fill_words gives 3 wrong values in samples"
+    )
 
 
 @pytest.mark.parametrize(("value", "code"), [("1e-6", 0), ("0.3", 4)])

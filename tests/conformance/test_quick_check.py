@@ -97,7 +97,7 @@ def test_runtime_exception_is_one_sentence():
 
     out = io.StringIO()
     worker_process._run(out, Check("rendering", (), check), lambda: None)
-    assert "the OpenCL runtime refuses a call: clCreateKernel failed: INVALID_KERNEL_NAME" in out.getvalue()
+    assert "the OpenCL runtime rejects a call: clCreateKernel failed: INVALID_KERNEL_NAME" in out.getvalue()
 
 
 def test_start_of_a_check_is_logged(monkeypatch, info, empty_cache, caplog):

@@ -191,10 +191,10 @@ def test_blend_gradients(rng):
     safe, stopped, faint = np.ones((HEIGHT, WIDTH), bool), np.zeros((HEIGHT, WIDTH), bool), 0
     for step in ref.blend_steps(splats, WIDTH, HEIGHT, thresholds):
         near_alpha_min = np.abs(step.alpha / thresholds.alpha_min - 1) < 0.3
-        near_stop = np.abs(step.before * (1 - step.alpha) / thresholds.transmittance_min - 1) < 0.3
-        safe &= ~(step.tried & (near_alpha_min | near_stop))
-        stopped |= step.candidate & ~step.blended
-        faint += step.tried & ~step.candidate
+        near_stop = np.abs(step.transmittance * (1 - step.alpha) / thresholds.transmittance_min - 1) < 0.3
+        safe &= ~(step.is_active & (near_alpha_min | near_stop))
+        stopped |= step.is_candidate & ~step.is_blended
+        faint += step.is_active & ~step.is_candidate
     assert np.sum(safe & stopped) > 10
     assert np.sum(safe & (faint > 0)) > 10
     weights = rng.normal(0, 1, (3, HEIGHT, WIDTH)) * safe
@@ -226,9 +226,9 @@ def test_absolute_mean2d_gradient(rng):
 def test_compensation_gradient_is_the_stable_form_of_8_2(rng):
     """d(det V / det V1)/dV is (1-κ²) K - k det(K) I."""
     camera = general_camera()
-    foot = ref.footprint(random_gaussians(rng, camera, 0), 0, camera, 0.1)
-    conic = np.linalg.inv(foot.dilated)
-    ratio = np.linalg.det(foot.sharp) / np.linalg.det(foot.dilated)
+    foot = ref.project_covariance(random_gaussians(rng, camera, 0), 0, camera, 0.1)
+    conic = np.linalg.inv(foot.filtered_cov2d)
+    ratio = np.linalg.det(foot.cov2d) / np.linalg.det(foot.filtered_cov2d)
     stable = (1 - ratio) * conic - 0.1 * np.linalg.det(conic) * np.eye(2)
     np.testing.assert_allclose(ref.ratio_gradient(foot), stable, rtol=1e-10)
 
@@ -286,7 +286,7 @@ def test_single_isotropic_gaussian():
     expected = color[:, None, None] * alpha + BACKGROUND[:, None, None] * (1 - alpha)
     np.testing.assert_allclose(frame.image, expected, rtol=1e-13)
     np.testing.assert_allclose(frame.transmittance, 1 - alpha, rtol=1e-13)
-    assert np.all(frame.blended == 1)
+    assert np.all(frame.splat_count == 1)
 
 
 def test_pixel_centers_and_axes():
@@ -307,7 +307,7 @@ def test_jacobian_is_the_derivative_of_the_projection(rng):
         five_point(lambda axis=axis: ref.project(gaussians, camera, 0).mean2d[0, axis], gaussians.means)[0]
         for axis in (0, 1)
     ]
-    analytic = ref.footprint(gaussians, 0, camera, 0.3).jacobian
+    analytic = ref.project_covariance(gaussians, 0, camera, 0.3).jacobian
     np.testing.assert_allclose(analytic @ camera.rotation, numeric, rtol=1e-8)
 
     limits = ref.ray_limits(camera)
@@ -315,7 +315,7 @@ def test_jacobian_is_the_derivative_of_the_projection(rng):
     gaussians.means = np.array([to_world(camera, 2 * np.array(point)) for point in (beyond, at_limit)])
     gaussians.quats, gaussians.log_scales = gaussians.quats[[0, 0]], gaussians.log_scales[[0, 0]]
     gaussians.filter_variance = np.zeros(2)
-    first, second = (ref.footprint(gaussians, n, camera, 0.3).jacobian for n in (0, 1))
+    first, second = (ref.project_covariance(gaussians, n, camera, 0.3).jacobian for n in (0, 1))
     np.testing.assert_allclose(first, second, rtol=1e-12)
 
 
@@ -603,7 +603,7 @@ def test_adam_of_visible_rows_leaves_other_rows(rng):
     parameter, gradient, moment1, moment2 = state
     whole = ref.adam_step(parameter, gradient, moment1, moment2, 3, 0.01)
     for after, updated, before in zip(
-        ref.adam_step(parameter, gradient, moment1, moment2, 3, 0.01, seen=seen),
+        ref.adam_step(parameter, gradient, moment1, moment2, 3, 0.01, mask=seen),
         whole,
         (parameter, moment1, moment2),
         strict=True,
@@ -652,7 +652,7 @@ def test_density_actions_of_absgs():
     gradient = np.array([3e-4, 1e-4, 3e-4, 1e-4])
     absolute = np.array([3e-4, 5e-4, 3e-4, 5e-4])
     scale = np.array([0.009, 0.009, 0.011, 0.011])
-    rule = ref.DensityRule(split_gradient=4e-4, dense=0.001)
+    rule = ref.DensityConstants(split_gradient=4e-4, dense=0.001)
     actions = ref.adc_actions(gradient, scale, np.full(4, 0.5), 10.0, False, rule, absolute)
     assert actions.tolist() == [ref.CLONE, ref.KEEP, ref.KEEP, ref.SPLIT]
 

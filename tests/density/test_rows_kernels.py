@@ -112,7 +112,7 @@ def test_invalid_selection_is_refused(device, rng, case):
     edit = edit_of(gaussians_of(device, rng))
     with pytest.raises(ValueError, match=message):
         edit.choose(*arguments)
-    assert (edit.rows() == 1).all()
+    assert (edit.row_counts() == 1).all()
 
 
 @on_one_setting

@@ -153,7 +153,7 @@ def test_absgs_splits_where_gradients_cancel(device):
     ]
     grad, absolute, size, rows = (list(column) for column in zip(*cases, strict=True))
     assert row_counts(device, grad, absolute, size, rules) == rows
-    rule = ref.DensityRule(split_gradient=4e-4, dense=0.001)
+    rule = ref.DensityConstants(split_gradient=4e-4, dense=0.001)
     oracle = ref.adc_actions(np.array(grad), np.array(size), np.full(5, 0.5), 1.0, False, rule, np.array(absolute))
     assert [1 + (action in (ref.CLONE, ref.SPLIT)) for action in oracle] == rows
 

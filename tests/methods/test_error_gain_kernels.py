@@ -65,7 +65,7 @@ def rows_of(stats: SplatStats, statistic: str, gradient_above: float) -> list[in
     """What a rule makes of the Gaussians."""
     edit = Edit(stats.gaussians, stats, SceneScale(1.0), step=600, seed=0)
     Clone(statistic=statistic, gradient_above=gradient_above, size_below=1e9).mark(edit)
-    return edit.rows().tolist()
+    return edit.row_counts().tolist()
 
 
 @on_one_setting

@@ -65,7 +65,7 @@ def pruned(survey: Survey, rule: PruneRedundant) -> np.ndarray:
     rule.mark(edit)
     for name, table in before.items():
         np.testing.assert_array_equal(gaussians.get(name), table)
-    return np.flatnonzero(edit.rows() == 0)
+    return np.flatnonzero(edit.row_counts() == 0)
 
 
 @on_devices("count, width, height", [(0, 16, 16), (1, 16, 16), (17, 33, 31), (40, 24, 24)])

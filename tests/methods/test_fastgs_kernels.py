@@ -160,13 +160,13 @@ def test_fraction_of_faint_and_large_gaussians_is_pruned(device, rng, faint):
     edit = edit_of(device, rng, 40, WrongPixels(np.zeros(40, int), rng.random(40)), sizes, opacity)
     edit.rule = 2
     PruneSampled(share=0.5).mark(edit)
-    removed = edit.rows() == 0
+    removed = edit.row_counts() == 0
     assert removed.sum() == (faint + 5) // 2
     assert not removed[faint:35].any()
     again = edit_of(device, np.random.default_rng(0), 40, WrongPixels(np.zeros(40, int), np.zeros(40)), sizes, opacity)
     again.rule = 2
     PruneSampled(share=1.0).mark(again)
-    assert (again.rows() == 0).sum() == faint + 5
+    assert (again.row_counts() == 0).sum() == faint + 5
 
 
 @on_one_setting
@@ -177,19 +177,19 @@ def test_gaussians_with_wrong_pixels_are_pruned_first(device, rng):
         edit = edit_of(device, rng, 2, WrongPixels(np.zeros(2, int), np.array([0.0, 0.75])), opacity=0.001)
         edit.seed = seed
         PruneSampled(share=0.5).mark(edit)
-        counts += edit.rows() == 0
+        counts += edit.row_counts() == 0
     assert counts.sum() == 400
     assert counts[1] / 400 == pytest.approx(0.8, abs=0.06)
     edit = edit_of(device, rng, 3, WrongPixels(np.zeros(3, int), np.array([0.99, 1.0, 0.99])), opacity=0.001)
     PruneSampled(share=0.34).mark(edit)
-    assert edit.rows().tolist() == [1, 0, 1]
+    assert edit.row_counts().tolist() == [1, 0, 1]
 
 
 @on_one_setting
 def test_gaussians_with_large_scores_are_pruned_late(device, rng):
     edit = edit_of(device, rng, 4, WrongPixels(np.zeros(4, int), np.array([0.0, 0.9, 0.91, 1.0])))
     PruneInaccurate(score_above=0.9).mark(edit)
-    assert edit.rows().tolist() == [1, 1, 0, 0]
+    assert edit.row_counts().tolist() == [1, 1, 0, 0]
 
 
 @on_devices("rule", [RevertGrowth(), PruneSampled(), PruneInaccurate()])

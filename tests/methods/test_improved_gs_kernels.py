@@ -63,7 +63,7 @@ def test_splits_beyond_the_limit_are_sampled_by_score(device, rng, room):
     edit = edit_of(device, rng, 20, np.where(np.arange(20) % 10 < 6, 1.0, 0.0))
     edit.max_rows = 20 + room
     SplitLongAxis().mark(edit)
-    rows = edit.rows()
+    rows = edit.row_counts()
     assert (rows == 2).sum() == max(room, 0)
     assert (rows[6:] == 1).all()
 
@@ -89,6 +89,6 @@ def test_lowest_opacities_are_pruned_and_growth_is_a_root(device, rng):
     edit = edit_of(device, rng, 20, np.ones(20))
     logits = edit.gaussians.get("logit_opacity")[:, 0]
     PruneLowestOpacity(share=0.2).mark(edit)
-    assert set(np.flatnonzero(edit.rows() == 0)) == set(np.argsort(logits)[:4])
+    assert set(np.flatnonzero(edit.row_counts() == 0)) == set(np.argsort(logits)[:4])
     limits = [SquareRoot(gaussians=1000).limit(edit, BudgetContext(x, 1, 1.0), {}) for x in (0.04, 0.25, 1.0)]
     assert limits == [200, 500, 1000]

@@ -96,4 +96,4 @@ def test_rarely_needed_and_light_gaussians_are_pruned(device, rng):
     edit = Edit(gaussians, SplatStats(gaussians), SceneScale(1.0), step=600, seed=3, survey=survey)
     edit.mark(copies=2, old_rows=1)
     PruneUseless(views_below=2, weight_total=0.999).mark(edit)
-    assert edit.rows().tolist() == [2, 0, 2, 0, 0]
+    assert edit.row_counts().tolist() == [2, 0, 2, 0, 0]

@@ -112,8 +112,8 @@ def test_growth_is_drawn_by_score(device, rng):
         edit.seed, edit.max_rows = seed, 210
         Clone(size_below=0.01).mark(edit)
         GrowScored().mark(edit)
-        assert (edit.rows() > 1).sum() == 10
-        counts += edit.rows() > 1
+        assert (edit.row_counts() > 1).sum() == 10
+        counts += edit.row_counts() > 1
     share = 22 / 3 * 20 / (22 / 3 * 20 + 180)  # of the first draw; a little less of ten
     assert counts[:20].sum() / counts.sum() == pytest.approx(share, abs=0.06)
 
@@ -126,7 +126,7 @@ def test_low_scores_are_pruned_first(device, rng):
         edit = edit_of(device, rng, np.full(2, 0.005), opacity=0.001, losses=np.array([1.0, 4.0]))
         edit.seed = seed
         PruneScored(share=0.5).mark(edit)
-        counts += edit.rows() == 0
+        counts += edit.row_counts() == 0
     assert counts.sum() == 300
     assert counts[0] / 300 == pytest.approx(0.8, abs=0.07)
 

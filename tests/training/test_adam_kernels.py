@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance.checks.projection import undrawable_case
-from clsplat.conformance.checks.training import check_average, check_seen_rows, check_step, put_every_fifth_behind
+from clsplat.conformance.checks.training import check_average, check_rows, check_step, move_every_fifth_behind
 from clsplat.conformance.scenes import Case, add_world_filter, random_case
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import DeviceModel
@@ -87,7 +87,7 @@ def test_steps(device, rng, count):
 )
 def test_fused_update_equals_stored_gradients(device, rng, count, degree, sh_rest, rows):
     """update_gaussians against project_backward and adam_step, bit for bit, moments and screen gradients too."""
-    case = put_every_fifth_behind(add_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng))
+    case = move_every_fifth_behind(add_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng))
     weights = rng.normal(size=(3, 32, 48)).astype(np.float32)
     weights[:, 30:], weights[:, :, 40:] = 0, 0
     tables = []
@@ -177,7 +177,7 @@ def test_rate_of_the_means_decays():
 @on_devices("count", [0, 16, 63, 64, 150])
 def test_visible_rows(device, rng, count):
     assert_within_bounds(
-        check_seen_rows(device, rng, put_every_fifth_behind(random_case(rng, count)), f"{count} Gaussians")
+        check_rows(device, rng, move_every_fifth_behind(random_case(rng, count)), f"{count} Gaussians")
     )
 
 
@@ -227,7 +227,7 @@ def test_degenerate_rows_keep_their_bits(device, rng, from_memory):
 
 @on_devices("vectors, rows", each_once([1, 2, 8, 1, 2, 8], ["all", "seen"]))
 def test_bits_do_not_depend_on_the_vectors_of_an_item(device, rng, vectors, rows):
-    case = put_every_fifth_behind(random_case(rng, 150))
+    case = move_every_fifth_behind(random_case(rng, 150))
     case.parameters["means"][40:90] -= 20 * case.view.world_to_camera[2, :3]  # whole vectors
     expected = updated(device, case, rows)[1]
     for name, table in updated(device, case, rows, vectors=vectors)[1].items():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clsplat.conformance.checks.training import check_deferred, put_every_fifth_behind, seen_rows, train
+from clsplat.conformance.checks.training import check_deferred, move_every_fifth_behind, random_visible_rows, train
 from clsplat.conformance.scenes import Case, add_world_filter, random_case
 from clsplat.core.errors import ConfigError
 from clsplat.gaussians.deferred import DeferredHarmonics
@@ -72,7 +72,7 @@ def test_deferred_updates(device, rng, count):
     ),
 )
 def test_deferred_updates_give_the_bits_of_immediate_ones(device, rng, count, degree, sh_rest, from_memory):
-    case = put_every_fifth_behind(add_world_filter(random_case(rng, count, degree=degree), rng))
+    case = move_every_fifth_behind(add_world_filter(random_case(rng, count, degree=degree), rng))
     assert_equal(device, case, sh_rest=sh_rest, from_memory=from_memory)
 
 
@@ -108,12 +108,12 @@ def drop_bands(model: DeviceModel, adam: Adam, step: int) -> None:
 
 @on_devices("edit", [raise_degree, move_rows, write_rows, drop_bands])
 def test_edits_apply_deferred_updates_first(device, rng, edit):
-    assert_equal(device, put_every_fifth_behind(random_case(rng, 100)), edit=edit)
+    assert_equal(device, move_every_fifth_behind(random_case(rng, 100)), edit=edit)
 
 
 def test_longest_list_does_not_change_the_bits(device, rng, monkeypatch):
     case = random_case(rng, 100)
-    seen = [seen_rows(rng, 100) for _ in range(7)]
+    seen = [random_visible_rows(rng, 100) for _ in range(7)]
     gradients = [rng.normal(size=(100, 45)).astype(np.float32) * mask[:, None] for mask in seen]
     results = []
     for longest in (1, 2, 7, 32):
@@ -158,7 +158,7 @@ def test_penalty_on_deferred_harmonics_is_refused(device, rng):
     each_once([(0, 3), (1, 3), (17, 2), (64, 0), (65, 3), (300, 3)], product(["all", "seen"], [False, True])),
 )
 def test_bits_do_not_depend_on_the_location_of_harmonics(device, rng, count, degree, rows, from_memory):
-    case = put_every_fifth_behind(add_world_filter(random_case(rng, count, degree=degree), rng))
+    case = move_every_fifth_behind(add_world_filter(random_case(rng, count, degree=degree), rng))
     on_device = bits_after(device, case, rows, from_memory=from_memory)
     on_host = bits_after(device, case, rows, from_memory=from_memory, on_host=True)
     for name, table in on_device.items():
@@ -167,7 +167,7 @@ def test_bits_do_not_depend_on_the_location_of_harmonics(device, rng, count, deg
 
 @on_devices("edit", [raise_degree, move_rows, write_rows, drop_bands])
 def test_edits_see_rows_on_the_host(device, rng, edit):
-    case = put_every_fifth_behind(random_case(rng, 100))
+    case = move_every_fifth_behind(random_case(rng, 100))
     on_device = bits_after(device, case, "all", edit=edit)
     for name, table in bits_after(device, case, "all", edit=edit, on_host=True).items():
         np.testing.assert_array_equal(table, on_device[name], err_msg=name)

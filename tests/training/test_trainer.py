@@ -174,7 +174,7 @@ def test_masked_pixels_have_no_gradient(any_device, rng):
     for planes in (comparison.gradient, comparison.image, comparison.photograph):
         assert (planes.get()[:, :30, :13] == 0).all()
         assert (planes.get()[:, :30, 13:40] != 0).mean() > 0.3
-    assert comparison.unmasked_value_count == 3 * 30 * 27
+    assert comparison.unmasked_size == 3 * 30 * 27
 
 
 # ---- losses in NumPy

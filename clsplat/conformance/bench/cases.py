@@ -261,7 +261,7 @@ SIZE = 2.2  # px, standard deviation of their splats
 SIZES = {"A": (400, 400, 50_000), "B": (800, 800, 300_000), "C": (1920, 1080, 1_000_000)}
 
 
-def synthetic(width: int, height: int, count: int) -> tuple[Parameters, View]:
+def synthetic_scene(width: int, height: int, count: int) -> tuple[Parameters, View]:
     """Return flat Gaussians of about SIZE px that face the camera, with log-normal sizes and random opacities."""
     rng = np.random.default_rng(0)
     u, v = rng.uniform(-8, width + 8, count), rng.uniform(-8, height + 8, count)
@@ -286,16 +286,16 @@ def synthetic(width: int, height: int, count: int) -> tuple[Parameters, View]:
 NEAR = 0.2  # scene units, near plane of the synthetic scenes
 
 
-def case(device: Device, width: int, height: int, count: int, settings: PipelineFile) -> BenchCase:
+def make_case(device: Device, width: int, height: int, count: int, settings: PipelineFile) -> BenchCase:
     """Return a benchmark of a synthetic scene, with noise as its photograph."""
-    parameters, view = synthetic(width, height, count)
+    parameters, view = synthetic_scene(width, height, count)
     camera = upload_camera(device, view)
     shape = (3, height, width)
     pixels = np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
     return BenchCase(device, parameters, Photograph(camera, device.upload(pixels)), "black", with_near(settings, NEAR))
 
 
-def real_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> BenchCase:
+def load_case(device: Device, model: Path, scene: Path, settings: PipelineFile) -> BenchCase:
     """Return a benchmark of a splat file, or of Gaussians from a point cloud, at the first training view."""
     loaded_scene, background = settings.scene.read(scene)
     photographs = Photographs(device, background)

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from clsplat.conformance.bench.cases import SIZES, BenchResult, Peaks, case, measure_peaks, real_case, run_bench
+from clsplat.conformance.bench.cases import SIZES, BenchResult, Peaks, load_case, make_case, measure_peaks, run_bench
 from clsplat.core.errors import ConfigError, quote
 from clsplat.core.reading import read_json
 from clsplat.core.text_table import text_table
@@ -56,9 +56,9 @@ def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
     except ValidationError as error:
         first = error.errors()[0]
         key_path = ".".join(map(str, first["loc"])) or "the file"
-        raise ConfigError(f"{path}: {key_path}: {first['msg']}; expected {EXPECTED}: create it again") from error
+        raise ConfigError(f"{path}: {key_path}: {first['msg']}; expected {EXPECTED}; create it again") from error
     if actual.pipeline != name:
-        raise ConfigError(f"{path}: expected the pipeline '{name}', got {quote(actual.pipeline)}")
+        raise ConfigError(f"{path}: expected the pipeline '{name}', got {quote(actual.pipeline)}; measure again")
     return {key: value for key, value in data.items() if key != "against"}  # the baseline of that measurement
 
 
@@ -67,17 +67,17 @@ def peaks_text(peaks: dict[str, float]) -> str:
     return f"{peaks['gflops']:.0f} GFLOP/s, {peaks['gexp']:.1f} Gexp/s, copy {peaks['gbytes']:.1f} GB/s"
 
 
-def compare_conditions(now: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
+def compare_conditions(new: dict[str, Any], earlier: dict[str, Any]) -> list[str]:
     """Return lines of text about differences between the `data` of two measurements, other than times."""
     lines = [f"earlier: {peaks_text(earlier['peaks'])}"]
-    if earlier["device"] != now["device"]:
+    if earlier["device"] != new["device"]:
         lines.append(f"  on another device: {quote(earlier['device'])}")
-    ratios = {unit: now["peaks"][key] / earlier["peaks"][key] for key, unit in UNITS.items() if earlier["peaks"][key]}
+    ratios = {unit: new["peaks"][key] / earlier["peaks"][key] for key, unit in UNITS.items() if earlier["peaks"][key]}
     if any(not 1 / MAX_PEAK_RATIO <= ratio <= MAX_PEAK_RATIO for ratio in ratios.values()):
         changes = ", ".join(f"{ratio:.2f} of its {unit}" for unit, ratio in ratios.items())
-        lines.append(f"  the device now gives {changes}: compare ratios to the floors")
-    if missing_names := [name for name in now["scenes"] if name not in earlier["scenes"]]:
-        lines.append(f"  without scenes: {', '.join(missing_names)}; it has {', '.join(earlier['scenes']) or 'none'}")
+        lines.append(f"  the device now reaches {changes}; compare the ratios to the floors instead of times")
+    if missing_names := [name for name in new["scenes"] if name not in earlier["scenes"]]:
+        lines.append(f"  scenes: {', '.join(earlier['scenes']) or 'none'}, without {', '.join(missing_names)}")
     return lines
 
 
@@ -89,7 +89,7 @@ def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str
     total = sum(result.floors.values())
     rows += [(row, getattr(result, key), total if "step" in row else None) for row, key in TOTALS.items()]
     old_times = {**earlier["stages"], **{row: earlier.get(key, 0.0) for row, key in TOTALS.items()}} if earlier else {}
-    cells = [["stage", "ms", "floor", "ratio", *(("was", "now/was") if earlier else ())]]
+    cells = [["stage", "ms", "floor", "ratio", *(("earlier", "now/earlier") if earlier else ())]]
     for stage, ms, floor in rows:
         ratio = (f"{floor:.2f}", f"{ms / floor:.2f}") if floor else ("", "")
         old_ms = old_times.get(stage, 0)
@@ -135,11 +135,11 @@ def measure(
     if unknown_names := [name for name in scenes if name not in SIZES]:
         raise ConfigError(f"--scenes: expected names from {', '.join(SIZES)}, got '{unknown_names[0]}'")
     if (model is None) != (scene is None):
-        raise ConfigError("bench: --model and --scene are used together; add the other one")
+        raise ConfigError("bench needs --model and --scene together; add the missing one")
     settings = load(pipeline).settings
     bench_device = open_device(device, schedule)
     peaks = measure_peaks(bench_device)
-    cases = {name: case(bench_device, *SIZES[name], settings) for name in scenes}
+    cases = {name: make_case(bench_device, *SIZES[name], settings) for name in scenes}
     if model is not None and scene is not None:
-        cases[model.stem] = real_case(bench_device, model, scene, settings)
+        cases[model.stem] = load_case(bench_device, model, scene, settings)
     return Measurement(bench_device.text, settings.name, peaks, run_bench(cases, peaks, repeats))

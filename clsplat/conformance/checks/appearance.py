@@ -78,9 +78,9 @@ def check_grid(
     gradients = grids.differentiate(workspace, camera, planes, grads, 1)
     grad_image, grad_grid = (array.get() for array in gradients)
     expected_image, expected_grid = ref.color_grid_backward(exact, grid, gradient[:3].astype(np.float64))
-    largest = max(float(np.abs(expected_image).max()), 1.0)
+    max_gradient = max(float(np.abs(expected_image).max()), 1.0)
     actual, kernel = grad_image[:3, :height, :width], "color_grid_backward"
-    yield compare_max(kernel, f"gradient, {label}", actual, expected_image, 1e-5, floor=largest)
+    yield compare_max(kernel, f"gradient, {label}", actual, expected_image, 1e-5, floor=max_gradient)
     yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, grad_image[:3]), 0.0)
     floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
     for kernel in ("color_grid_row_sums", "color_grid_gather"):
@@ -106,8 +106,8 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
         kernel = "color_grid_smoothness"
         yield compare_max(kernel, f"value, {label}", actual, truth, SUM, floor=1e-2)
         actual, truth = photograph_grid(grids, grad_smoothness), weight * slope
-        largest = max(float(np.abs(truth).max()), 1e-6)
-        yield compare_max(kernel, f"derivatives, {label}", actual, truth, 2e-5, floor=largest)
+        max_gradient = max(float(np.abs(truth).max()), 1e-6)
+        yield compare_max(kernel, f"derivatives, {label}", actual, truth, 2e-5, floor=max_gradient)
         gradient = rng.normal(0, 0.1, row_length(nodes)).astype(np.float32)
         grids.learn(workspace, 1, device.upload(gradient), step)
         total = gradient.astype(np.float64) + grad_smoothness
@@ -195,8 +195,8 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     yield compare_max(kernel, f"colors, {label}", colors[:3, :height, :width], expected, 3e-6, floor=1.0)
     yield match(kernel, f"pixels outside the image, {label}", blank_image(camera, colors[:3]), 0.0)
     expected, grad_row = appearance.apply_response_backward(exact, row, center, upstream)
-    largest = max(float(np.abs(expected).max()), 1.0)
-    yield compare_max(kernel, f"gradient, {label}", grad_image[:3, :height, :width], expected, 1e-5, floor=largest)
+    max_gradient = max(float(np.abs(expected).max()), 1.0)
+    yield compare_max(kernel, f"gradient, {label}", grad_image[:3, :height, :width], expected, 1e-5, floor=max_gradient)
     yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, grad_image[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
     actual = row_gradient(row, sums)

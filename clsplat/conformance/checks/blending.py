@@ -142,9 +142,9 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
     yield from check_sum(case, sum_pixels(device, case, weights, ABS_X + 2), weights, "with absolute gradients")
     m = sum_pixels(device, case, weights, ALL_SUMS, texture=texture)
     yield from check_sum(case, m, weights, "with weights and texture")
-    blended = ref.blend_weights(case.project(), width, height) * (texture >= 0)
-    yield compare("blend_backward", "sums of weights", m[:, WEIGHT], blended.sum(axis=(1, 2)), GRADIENT)
-    expected = (blended * texture).sum(axis=(1, 2))
+    blend_weights = ref.blend_weights(case.project(), width, height) * (texture >= 0)
+    yield compare("blend_backward", "sums of weights", m[:, WEIGHT], blend_weights.sum(axis=(1, 2)), GRADIENT)
+    expected = (blend_weights * texture).sum(axis=(1, 2))
     yield compare("blend_backward", "sums of texture", m[:, WEIGHT + 1], expected, GRADIENT)
     squares = ref.falloff_squares(case.project(), width, height, BACKGROUND.astype(np.float64), weights)
     yield compare("blend_backward", "sums of squares", m[:, SQUARE], squares, GRADIENT)
@@ -282,8 +282,8 @@ def inverse_depths(device: Device, rng: np.random.Generator) -> Results:
         )
         image, *sums = differentiate(device, case, weights)
         yield match("blend_forward", f"colors, {label}", image[:3], color_frame.image.get()[:, :height, :width])
-        for actual, by_bands in zip(sums, differentiate(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
-            yield match("sum_inverse_depths", f"against bands of tiles, {label}", by_bands, actual)
+        for actual, band_sums in zip(sums, differentiate(device, case, weights, RenderLimits(40, 3))[1:], strict=True):
+            yield match("sum_inverse_depths", f"against bands of tiles, {label}", band_sums, actual)
 
 
 @CHECKS.add("blend_forward")
@@ -295,7 +295,7 @@ def median_depths(device: Device, rng: np.random.Generator) -> Results:
         image = rasterizer.forward(case.model(device), camera, device.zeros(3), "depth").image.get()
         expected, gap = ref.median_depth(case.project(), width, height)
         is_safe = gap > MARGIN
-        yield count_true("blend_forward", f"median depths near a step, {label}", ~is_safe, allowed=0.02 * is_safe.size)
+        yield count_true("blend_forward", f"median depths near a step, {label}", ~is_safe, limit=0.02 * is_safe.size)
         actual = image[2, :height, :width]
         yield compare_max("blend_forward", f"median depths, {label}", actual[is_safe], expected[is_safe], DEPTH)
 
@@ -345,8 +345,8 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
     inside = np.s_[..., :height, :width]
     exact = transmittance.astype(np.float64)
     yield compare_max("lay_over", f"sum, {label}", composite[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
-    loss, grad_left = ref.layer_cover(exact, scale)
-    yield compare_max("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_left)[None], 1e-6, floor=scale)
+    loss, grad_t = ref.layer_cover(exact, scale)
+    yield compare_max("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_t)[None], 1e-6, floor=scale)
     yield compare_max("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
     for output in (composite, behind):
         yield match("lay_over", f"pixels outside the image, {label}", blank_image(camera, output), 0.0)

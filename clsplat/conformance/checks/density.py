@@ -74,9 +74,8 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
         yield match("count_seen", f"views of {count} Gaussians", gaussians.get(SEEN)[:, 0], 2.0 * is_visible)
         for (name, kernel), values in columns.items():
             actual = gaussians.get(f"stats/{name}")[:, 0]
-            expected = (
-                2 * values * (is_visible | (name == "view_error"))
-            )  # view_error also counts for invisible Gaussians
+            is_counted = is_visible | (name == "view_error")  # which also counts for invisible Gaussians
+            expected = 2 * values * is_counted
             yield compare_max(kernel, f"{name} of {count} Gaussians", actual, expected, SUM, floor=0.1)
 
 

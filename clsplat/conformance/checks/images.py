@@ -70,8 +70,8 @@ def check_loss(
     yield compare_max(value_kernel, f"value of {label}", *values, SUM, floor=1e-2)
     planes, camera = comparison.gradient.get(), comparison.camera
     error = np.abs(planes[:, : camera.height, : camera.width] - weight * gradient).max()
-    largest = max(float(np.abs(weight * gradient).max()), 1e-30)
-    yield Deviation(kernel, f"gradient of {label}", float(error) / largest, LOSS_GRADIENT)
+    max_gradient = max(float(np.abs(weight * gradient).max()), 1e-30)
+    yield Deviation(kernel, f"gradient of {label}", float(error) / max_gradient, LOSS_GRADIENT)
     yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, planes), 0.0)
 
 
@@ -144,7 +144,7 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
             planes = Planes(workspace, camera, to_planes(device, camera, image), mask_plane)
             actual = Blur(sigma=sigma).apply(planes, step=1).colors.get()
             expected = ref.blur(image.astype(np.float64), sigma, mask)
-            label = f"sigma {sigma:g}, {width} x {height} px"
+            label = f"colors, sigma {sigma:g}, {width} x {height} px"
             yield compare_max("blur_columns", label, actual[:, :height, :width], expected, 2e-5, floor=0.05)
             yield match("blur_columns", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
 
@@ -164,13 +164,13 @@ def check_haar(
     planes = Planes(workspace, camera, to_planes(device, camera, image), mask_plane)
     actual, exact = apply_filter(planes, scalars).colors.get(), image.astype(np.float64)
     expected = ref.haar_filter(exact, taps, mask)
-    yield compare_max("haar_forward", label, actual[:, :height, :width], expected, 2e-6, floor=1.0)
+    yield compare_max("haar_forward", f"colors, {label}", actual[:, :height, :width], expected, 2e-6, floor=1.0)
     yield match("haar_forward", f"pixels outside the image, {label}", blank_image(camera, actual), 0.0)
     derivatives = filter_gradients(planes, scalars, to_planes(device, camera, gradient))()
     grad_taps = ref.haar_gradient(exact, gradient, taps, mask)
     grad_scalars = np.array([grad_taps[0] - grad_taps[1], grad_taps.sum()]) / np.sqrt(2)
     actual, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
-    yield compare_max("haar_backward", label, actual, grad_scalars, SUM, floor=size)
+    yield compare_max("haar_backward", f"gradients of the taps, {label}", actual, grad_scalars, SUM, floor=size)
 
 
 @CHECKS.add("haar_forward", "haar_backward")
@@ -214,26 +214,26 @@ def check_transient(
     """Compare residuals, their histogram, and masks.  A `fraction` of pixels is unmasked; None: all pixels."""
     x, y = image_pair(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
-    valid = np.ones((height, width), bool) if fraction is None else rng.random((height, width)) < fraction
+    unmasked = np.ones((height, width), bool) if fraction is None else rng.random((height, width)) < fraction
     camera, workspace = make_camera(device, width, height), Workspace(device)
     for name in ("residuals", "counted pixels"):
         workspace.array(name, (1, camera.rows, camera.stride)).fill(7)
-    mask = None if fraction is None else to_planes(device, camera, valid[None])
+    mask = None if fraction is None else to_planes(device, camera, unmasked[None])
     planes = to_planes(device, camera, x), to_planes(device, camera, y)
     actual, wait_for_histogram = measure_residuals(workspace, camera, *planes, mask)
     label, values = f"{width} x {height} px", actual.get()[0, :height, :width]
     exact = ref.residuals(x.astype(np.float64), y.astype(np.float64))
-    yield compare_max("measure_residuals", f"residuals, {label}", values[valid], exact[valid], 1e-6, floor=1e-6)
+    yield compare_max("measure_residuals", f"residuals, {label}", values[unmasked], exact[unmasked], 1e-6, floor=1e-6)
     excluded_pixels = actual.get()[0].copy()
-    excluded_pixels[:height, :width][valid] = -1
+    excluded_pixels[:height, :width][unmasked] = -1
     yield match("measure_residuals", f"pixels that do not count, {label}", excluded_pixels, -1.0)
-    histogram = ref.residual_histogram(values[valid].astype(np.float64))
+    histogram = ref.residual_histogram(values[unmasked].astype(np.float64))
     yield match("measure_residuals", f"histogram, {label}", wait_for_histogram(), histogram)
     for quantile, reach in ((0.2, 1), (0.5, 1), (0.6, 3), (0.9, 2)):
         threshold = float(np.float32(np.quantile(values, quantile)))
         mask = mask_transients(workspace, camera, actual, threshold, reach).get()[0]
         expected = np.zeros_like(mask)
-        expected[:height, :width] = ref.mask_transients(values, valid, threshold, reach)
+        expected[:height, :width] = ref.mask_transients(values, unmasked, threshold, reach)
         yield match("mask_transients", f"mask, {label}", mask, expected)
 
 

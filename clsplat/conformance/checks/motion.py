@@ -39,7 +39,7 @@ def moving_case(rng: np.random.Generator, count: int, width: int = 5) -> Case:
 def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, width: int) -> Results:
     """Compare the tables at TIME, and the gradients of the motion."""
     case, (degree, has_rotation) = moving_case(rng, count, width), WIDTHS[width]
-    model, camera, label = case.model(device), case.device_camera(device), f"{count} of {width} columns"
+    model, camera, label = case.model(device), case.device_camera(device), f"{count} Gaussians, {width} columns"
     p = {name: table.astype(np.float64) for name, table in case.parameters.items()}
     logit = p["logit_opacity"][:, 0]
     actual_gaussians = evaluate_motion(Workspace(device), model, camera).gaussians
@@ -66,8 +66,8 @@ def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, w
     actual, grad_center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
     kernel = "turn_backward" if has_rotation else "move_backward"
     for name, columns in motion_fields(width).items():
-        yield compare(kernel, f"by {name}, {label}", actual[:, columns], grad_motion[:, columns], CONIC)
-    yield compare("move_backward", f"by the logit at the center, {label}", grad_center, grad_logit, CONIC)
+        yield compare(kernel, f"gradient of {name}, {label}", actual[:, columns], grad_motion[:, columns], CONIC)
+    yield compare("move_backward", f"gradient of the logit at the center, {label}", grad_center, grad_logit, CONIC)
 
 
 def check_zero_motion(device: Device, rng: np.random.Generator) -> Results:
@@ -101,10 +101,10 @@ def check_step(device: Device, rng: np.random.Generator, count: int, width: int,
         planes = np.zeros(gradients[MOTION].shape, np.float32)
         planes[:, :count] = gradient.T
         gradients[MOTION].set(planes)
-        values, m, v = ref.adam_step(values, gradient.astype(np.float64), m, v, step, column_rates, seen=is_visible)
+        values, m, v = ref.adam_step(values, gradient.astype(np.float64), m, v, step, column_rates, mask=is_visible)
         values[is_visible, 4] = np.maximum(values[is_visible, 4], min_duration)
         update_motion(gaussians, gradients, frame.depth_key, rates, step, every)
-    label = f"{count} of {width} columns" + (", only of visible rows" if every == 0 else "")
+    label = f"{count} Gaussians, {width} columns" + (", only of visible rows" if every == 0 else "")
     actual, initial = gaussians.get(MOTION), case.parameters[MOTION]
     yield match("motion_step", f"values of invisible rows, {label}", actual[~is_visible], initial[~is_visible])
     yield compare_max("motion_step", f"values, {label}", actual, values, 2e-5, floor=1.0)

@@ -87,12 +87,12 @@ class FieldCase:
         """The parameters in a new array on the device."""
         return self.levels.workspace.device.upload(self.parameters)
 
-    def units(self, samples: int, kind: int) -> NDArray[np.float64]:
+    def uniforms(self, samples: int, stream: int) -> NDArray[np.float64]:
         """Return the random numbers for the edges of each ray, [rays, samples + 1]."""
         draw = self.rays.draw or RandomKey(0, 0, 0)
         count = self.rays.count
         rays = range(draw.first, draw.first + count)
-        return np.stack([ref.random_units(ray, samples + 1, kind, draw.seed, draw.step) for ray in rays])
+        return np.stack([ref.uniform_numbers(ray, samples + 1, stream, draw.seed, draw.step) for ray in rays])
 
     def target_colors(self) -> NDArray[np.float64]:
         """Return the colors of the rays in the photograph, without padding, [rays, 3]."""
@@ -137,7 +137,7 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
         case = FieldCase.sample(device, rng, count, RandomKey(7, 11, 5))
         pixels = ref.draw_pixels(WIDTH * HEIGHT, count, 5, 7, 11)
         yield match("draw_pixels", f"pixels of {count} rays", case.rays.pixels.get(), pixels)
-        yield compare_max("cast_rays", f"{count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
+        yield compare_max("cast_rays", f"cones of {count} rays", case.rays.cones.get(), case.cones, 1e-5, floor=0.1)
         for rays in (case.rays, replace(case.rays, draw=None)):
             yield from _check_edge(replace(case, rays=rays), f"{count} rays, {'drawn' if rays.draw else 'even'}")
 
@@ -147,13 +147,13 @@ def _check_edge(case: FieldCase, label: str) -> Results:
         (level.edges.get(), level.weights.get()) for level in case.levels.render(case.device_parameters, case.rays)
     )
     shape, (edges, weights) = case.shape, coarse_edges
-    coarse_units, fine_units = case.units(shape.coarse_samples, ref.COARSE), case.units(shape.fine_samples, ref.FINE)
+    coarse, fine = case.uniforms(shape.coarse_samples, ref.COARSE), case.uniforms(shape.fine_samples, ref.FINE)
     is_drawn = case.rays.draw is not None
     expected = [
-        ref.coarse_edges(shape.near, shape.far, shape.coarse_samples, row if is_drawn else None) for row in coarse_units
+        ref.coarse_edges(shape.near, shape.far, shape.coarse_samples, row if is_drawn else None) for row in coarse
     ]
-    yield compare_max("spread_edges", label, edges, np.stack(expected), EDGES, floor=shape.far)
-    pairs = zip(edges.astype(np.float64), weights.astype(np.float64), fine_units, strict=True)
+    yield compare_max("spread_edges", f"coarse edges, {label}", edges, np.stack(expected), EDGES, floor=shape.far)
+    pairs = zip(edges.astype(np.float64), weights.astype(np.float64), fine, strict=True)
     expected = [ref.fine_edges(t, w, shape.fine_samples, row if is_drawn else None) for t, w, row in pairs]
     yield compare_max("resample_edges", label, fine_edges[0], np.stack(expected), 10 * EDGES, floor=shape.far)
 
@@ -257,7 +257,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
 
 # A field: its network, the colors of rays, the gradients of all parameters, images, and updates.
 
-FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
+FIELD_CASES: list[tuple[int, dict[str, Any]]] = [
     *((count, {}) for count in RAYS),
     *((9, keys) for keys in ({"skip": None, "depth": 1}, {"degrees": 3}, {"skip": 0})),
     *((9, {"grid": GRID, **keys}) for keys in ({}, {"skip": None, "depth": 1, "degrees": 0})),
@@ -270,7 +270,7 @@ FIELDS_CASES: list[tuple[int, dict[str, Any]]] = [
 )
 def fields(device: Device, rng: np.random.Generator) -> Results:
     """Compare the colors of rays, and the gradients of all parameters through the coarse and fine samples."""
-    for count, keys in FIELDS_CASES:
+    for count, keys in FIELD_CASES:
         case = FieldCase.sample(device, rng, count, RandomKey(3, 4, 2), **keys)
         gradient = device.zeros(case.shape.parameters)
         errors, expected = device.zeros(2 + count), list[ref.Weights]()
@@ -288,7 +288,7 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
                 grad_features = grad_position[:, FEATURES * number : FEATURES * (number + 1)]
                 grad_entries[number] += grid.level.backward(grad_features, *case.grid_positions(level.edges.get()))
         for number, (grid, truth) in enumerate(zip(case.grid_levels(), grad_entries, strict=True)):
-            label = f"level {number} of the grid, {count} rays, skip {case.shape.skip}"
+            label = f"gradients of level {number} of the grid, {count} rays, skip {case.shape.skip}"
             for name in ("dense_backward", "grid_backward"):
                 yield compare(name, label, grid.entries(gradient.get()), truth, GRADIENT)
         yield from _check_gradient(case.shape, gradient.get(), expected, f"{count} rays")
@@ -344,7 +344,10 @@ class _Comparison:
             yield compare_max("dense_forward", f"raw {name}, {label}", actual, expected, 1e-4, 1.0)
         weights, transmittance = self.composite.weights()
         level = self.level
-        for name, table, truth in (("weights", level.weights, weights), ("left", level.transmittance, transmittance)):
+        for name, table, truth in (
+            ("weights", level.weights, weights),
+            ("transmittance", level.transmittance, transmittance),
+        ):
             yield compare_max("composite_forward", f"{name}, {label}", table.get(), truth, 1e-4, 1.0)
         yield compare_max("composite_forward", label, self.level.colors.get(), self.composite.colors(), 1e-4, 1.0)
 

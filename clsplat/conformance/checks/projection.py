@@ -67,7 +67,7 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     may_be_culled = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)
     yield count_true(
         kernel,
-        f"which splats are drawn, {label}",
+        f"visibility, {label}",
         (is_rendered & ~truth.visible) | (truth.visible & ~is_rendered & ~may_be_culled),
     )
     is_rendered &= truth.visible
@@ -89,7 +89,7 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     )
     # ceil() may jump by a pixel where the radius is close to an integer
     yield count_true(kernel, f"radii, {label}", ~(np.abs(radius - truth.radius) <= 1))
-    yield count_true(kernel, f"exact radii, {label}", radius != truth.radius, allowed=0.02 * len(radius))
+    yield count_true(kernel, f"exact radii, {label}", radius != truth.radius, limit=0.02 * len(radius))
     yield count_true(kernel, f"extents, {label}", _wrong_extents(record, truth, is_rendered))
 
 
@@ -107,12 +107,12 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, is_rendered: NDArray
     half_x, half_y = np.sqrt(reach2 * c / (a * c - b * b)), np.sqrt(reach2 * a / (a * c - b * b))
     if truth.pixel_box:  # from the covariance, half a pixel wider on each side
         half_x, half_y = 0.5 + np.sqrt(reach2 * a), 0.5 + np.sqrt(reach2 * c)
-    is_right = np.ones(len(record), bool)
+    is_correct = np.ones(len(record), bool)
     for low, high, center, half in ((11, 12, 0, half_x), (9, 10, 1, half_y)):
         mean = truth.mean2d[is_rendered, center]
-        is_right &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
-        is_right &= record[:, high] - record[:, low] <= 2.4 * half + (3 if truth.pixel_box else 1)
-    return ~is_right
+        is_correct &= (record[:, high] >= mean + half - 1e-3) & (record[:, low] <= mean - half + 1e-3)
+        is_correct &= record[:, high] - record[:, low] <= 2.4 * half + (3 if truth.pixel_box else 1)
+    return ~is_correct
 
 
 def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
@@ -156,8 +156,8 @@ def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[s
     grad_mean2d, grad_conic = sums_to_gradients(truth, m)
     grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
     upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
-    reference, camera = case.gaussians(), case.camera()
-    expected = ref.project_backward(reference, camera, case.degree, case.variance, case.compensate, truth, *upstream)
+    gaussians, camera = case.gaussians(), case.camera()
+    expected = ref.project_backward(gaussians, camera, case.degree, case.variance, case.compensate, truth, *upstream)
     sh = expected.pop("sh")
     return {
         **expected,
@@ -200,9 +200,9 @@ def clamped_case(rng: np.random.Generator) -> Case:
     """Return a case of large Gaussians with rays beyond the limits at which the linear projection is clamped."""
     case = random_case(rng, 30)
     depth, slope = rng.uniform(1, 2, 30), rng.choice([-1, 1], 30) * rng.uniform(0.9, 1.3, 30)
-    in_camera = np.stack([slope * depth, 0.2 * depth, depth], axis=1)
+    camera_points = np.stack([slope * depth, 0.2 * depth, depth], axis=1)
     rotation, translation = case.view.world_to_camera[:, :3], case.view.world_to_camera[:, 3]
-    case.parameters["means"][:] = (in_camera - translation) @ rotation
+    case.parameters["means"][:] = (camera_points - translation) @ rotation
     case.parameters["log_scales"][:] = np.log(0.6) + rng.normal(0, 0.2, (30, 3))
     return case
 
@@ -327,7 +327,7 @@ def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str)
     settings = case.degree, case.variance, case.compensate
     expected = ref.pose_gradient(case.gaussians(), case.camera(), *settings, truth, *upstream)
     rotation = case.camera().rotation
-    values = {"shift": rotation @ actual[:3], "turn": rotation @ actual[3:6], "focal length": actual[6:]}
+    values = {"translation": rotation @ actual[:3], "rotation": rotation @ actual[3:6], "focal length": actual[6:]}
     for (name, value), exact in zip(values.items(), expected, strict=True):
         yield compare("pose_gradient", f"gradient of the {name}, {label}", value[None], exact[None], CONIC)
 

@@ -192,9 +192,9 @@ def check_wrong_counts(device: Device, case: Case) -> Results:
     gaussian_count, camera = len(case.parameters["means"]), frame.camera
     box = rasterizer.workspace.array("tile_box", gaussian_count, np.uint32)
     actual = frame.lists.tile_count.get()[:gaussian_count].astype(int)
-    large = (box.get() >> 24 == 33) & (actual > 0)
+    is_large = (box.get() >> 24 == 33) & (actual > 0)
     for extra in SURPLUS:
-        counts = np.where(large, np.maximum(1, actual + extra), 0)
+        counts = np.where(is_large, np.maximum(1, actual + extra), 0)
         first = np.concatenate([[0], np.cumsum(counts)])
         arrays = [device.upload(np.full(first[-1] + 64, UNTOUCHED, np.uint32)) for _ in range(2)]
         device.program("large.cl").emit_large(

@@ -59,9 +59,9 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
         yield compare_max("adam_step", label, actual, values[name], 3e-7, floor=2e-5 * max_change / 3e-7)
         # 1 - 0.999f is off by 1.3e-5 in float32
         for moment, expected, bound in zip(moment_tables(name), moments[name], (SUM, 3 * SUM), strict=True):
-            largest = float(np.abs(expected).max())
+            max_moment = float(np.abs(expected).max())
             actual = model.gaussians.get(moment)
-            yield compare_max("adam_step", f"moments of {label}", actual, expected, bound, floor=0.1 * largest)
+            yield compare_max("adam_step", f"moments of {label}", actual, expected, bound, floor=0.1 * max_moment)
 
 
 def _random_pixel_sums(
@@ -94,7 +94,7 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str
         yield compare_max(kernel, f"{name}, {label}", gaussians.get(name), initial - step, 3e-7, floor)
 
 
-def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
+def check_rows(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
     """Compare the fifth update, limited to visible rows, by each kernel, given the same gradients and moments."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
@@ -116,8 +116,8 @@ def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label:
             tables = name, *moment_tables(name)
             initial, moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in tables)
             gradient = gradients[name].get()[:, :count].T.astype(np.float64)
-            updated = ref.adam_step(initial, gradient, moment1, moment2, 5, rates[name], seen=is_visible)
-            expected |= dict(zip(tables, updated, strict=True))
+            results = ref.adam_step(initial, gradient, moment1, moment2, 5, rates[name], mask=is_visible)
+            expected |= dict(zip(tables, results, strict=True))
         if kernel == "adam_step":
             adam.step(model, frame, gradients, rates, rows="seen")
         else:
@@ -130,7 +130,7 @@ def check_seen_rows(device: Device, rng: np.random.Generator, case: Case, label:
             )
 
 
-def put_every_fifth_behind(case: Case) -> Case:
+def move_every_fifth_behind(case: Case) -> Case:
     """Return the case with every fifth Gaussian behind the camera."""
     case.parameters["means"][1::5] -= 20 * case.view.world_to_camera[2, :3]
     return case
@@ -145,7 +145,7 @@ def adam_updates(device: Device, rng: np.random.Generator) -> Results:
 @CHECKS.add("adam_step", "update_gaussians")
 def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
-        yield from check_seen_rows(device, rng, put_every_fifth_behind(random_case(rng, count)), f"{count} Gaussians")
+        yield from check_rows(device, rng, move_every_fifth_behind(random_case(rng, count)), f"{count} Gaussians")
 
 
 @CHECKS.add("update_gaussians")
@@ -153,7 +153,7 @@ def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Re
     for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
         case = add_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
         label = f"{count} Gaussians, degree {degree}"
-        yield from check_fused(device, rng, put_every_fifth_behind(case), label)
+        yield from check_fused(device, rng, move_every_fifth_behind(case), label)
 
 
 def check_penalty(
@@ -248,24 +248,24 @@ MAX_DEFERRED = 5  # less than STEPS, so that the list fills up once
 STEPS = 8
 
 
-def seen_rows(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
+def random_visible_rows(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
     """Return a random mask, [N], of the rows visible in a view: a few rows in some of the blocks of 16."""
     blocks = rng.random(-(-count // 16)) < 0.4
     return blocks.repeat(16)[:count] & (rng.random(count) < 0.5)
 
 
 def train(
-    device: Device, model: DeviceModel, seen: list[NDArray[np.bool_]], gradients: list[NDArray[np.float32]], rows: Rows
+    device: Device, model: DeviceModel, masks: list[NDArray[np.bool_]], gradients: list[NDArray[np.float32]], rows: Rows
 ) -> dict[str, NDArray[np.float32]]:
     """Update a model once for each view, and return the SH coefficients and their moments.
 
-    seen: for each view, the mask of visible rows, [N]; gradients: of the SH coefficients, [N, components].
+    masks: for each view, the mask of visible rows, [N]; gradients: of the SH coefficients, [N, components].
     """
     gaussians, adam = model.gaussians, Adam(model.gaussians)
     camera = random_case(np.random.default_rng(0), 1).device_camera(device)
     frame = Rasterizer(device, "radix").forward(model, camera, device.upload(BACKGROUND))
     deferred = gaussians.deferred = DeferredHarmonics(gaussians, MAX_DEFERRED) if rows == "deferred" else None
-    for step, (mask, gradient) in enumerate(zip(seen, gradients, strict=True), 1):
+    for step, (mask, gradient) in enumerate(zip(masks, gradients, strict=True), 1):
         keys = np.full(gaussians.capacity, CULLED, np.uint32)
         keys[: gaussians.count][mask] = 7
         view_frame = replace(frame, depth_key=device.upload(keys))
@@ -275,8 +275,8 @@ def train(
         loss_gradients["sh_rest"].set(planes)
         if deferred:
             deferred.catch_up(view_frame.depth_key)
-        excluded = set(gaussians.trained) - {"sh_rest"}
-        adam.step(model, view_frame, loss_gradients, Rates().at(step, extent=2.0), excluded, rows)
+        excluded_names = set(gaussians.trained) - {"sh_rest"}
+        adam.step(model, view_frame, loss_gradients, Rates().at(step, extent=2.0), excluded_names, rows)
     return {name: gaussians.get(name) for name in DeferredHarmonics.names}
 
 
@@ -284,14 +284,14 @@ def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Resu
     """Compare deferred updates with the reference, and with the bits of immediate updates."""
     case = random_case(rng, count)
     initial = case.parameters["sh_rest"]
-    seen = [seen_rows(rng, count) for _ in range(STEPS)]
-    gradients = [rng.normal(size=initial.shape).astype(np.float32) * mask[:, None] for mask in seen]
+    masks = [random_visible_rows(rng, count) for _ in range(STEPS)]
+    gradients = [rng.normal(size=initial.shape).astype(np.float32) * mask[:, None] for mask in masks]
     values, moment1, moment2 = initial.astype(np.float64), np.zeros(initial.shape), np.zeros(initial.shape)
     for step, gradient in enumerate(gradients, 1):
         rate = Rates().at(step, extent=2.0)["sh_rest"]
         values, moment1, moment2 = ref.adam_step(values, gradient.astype(np.float64), moment1, moment2, step, rate)
-    actual = train(device, case.model(device), seen, gradients, "deferred")
-    immediate = train(device, case.model(device), seen, gradients, "all")
+    actual = train(device, case.model(device), masks, gradients, "deferred")
+    immediate = train(device, case.model(device), masks, gradients, "all")
     max_change = max(float(np.abs(values - initial).max(initial=0)), 1e-6)
     yield compare_max("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * max_change / 3e-7)
     for name, expected, bound in zip(DeferredHarmonics.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
@@ -367,5 +367,5 @@ def dropout(device: Device, rng: np.random.Generator) -> Results:
         case = replace(random_case(rng, count), dropout=DROPOUT)
         yield from check_dropout(device, case, rng, f"{count} Gaussians, some dropped")
         yield from check_hidden(device, case, rng)
-    filtered = add_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
-    yield from check_dropout(device, replace(filtered, dropout=DROPOUT), rng, "30 filtered Gaussians, some dropped")
+    case = add_world_filter(random_case(rng, 30, variance=0.1, compensate=1.0), rng)
+    yield from check_dropout(device, replace(case, dropout=DROPOUT), rng, "30 filtered Gaussians, some dropped")

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.bench.cases import Peaks, measure_peaks, run_bench
-from clsplat.conformance.bench.cases import case as bench_case
+from clsplat.conformance.bench.cases import Peaks, make_case, measure_peaks, run_bench
 from clsplat.conformance.check import Checks, Deviation, Note, Results, compare_max, match
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.core.errors import MemoryLimitError
@@ -32,7 +31,7 @@ STEPS = 60
 MAX_TRAINING_S = 40.0  # time after which a slow device stops early
 MEMORY_FRACTION = 0.25  # of free memory to use, since device and host may share it and must not swap
 FIRST_BUFFER = 128 << 20  # bytes
-MAX_TOUCH_S = 4.0  # longest time to write a buffer
+MAX_WRITE_S = 4.0  # longest time to write a buffer
 IN_USE = "other programs may use the device's memory; close them and run `clsplat doctor` again"
 BENCH = (256, 256, 20_000)  # width, height, Gaussians
 
@@ -98,25 +97,25 @@ def memory(device: Device, rng: np.random.Generator) -> Results:
     A failed allocation is not a failure of the check, since other programs may use memory, which OpenCL does not
     report.
     """
-    max_allocation, free = device.info.allocation, available_memory()
-    budget = int(MEMORY_FRACTION * min(device.info.memory, device.info.memory if free is None else free))
+    max_allocation, free_memory = device.info.allocation, available_memory()
+    budget = int(MEMORY_FRACTION * min(device.info.memory, device.info.memory if free_memory is None else free_memory))
     limit = min(max_allocation, budget) // 64 * 64  # allocations are rounded up to 64
-    largest, size = 0, min(FIRST_BUFFER, limit)
+    tested_size, size = 0, min(FIRST_BUFFER, limit)
     end_reason = "more was not tried, because too little memory is free"
-    while size > largest:
+    while size > tested_size:
         start = time.perf_counter()
         try:
             yield from _check_buffer(device, size)
         except MemoryLimitError:
             end_reason = f"a buffer of {size / 2**20:,.0f} MiB cannot be allocated: {IN_USE}"
             break
-        largest, size = size, min(2 * size, limit)
-        if 2 * (time.perf_counter() - start) > MAX_TOUCH_S and size > largest:
+        tested_size, size = size, min(2 * size, limit)
+        if 2 * (time.perf_counter() - start) > MAX_WRITE_S and size > tested_size:
             end_reason = "more was not tried, because it would take too long"
             break
-    if largest == max_allocation // 64 * 64:
+    if tested_size == max_allocation // 64 * 64:
         end_reason = "the largest size works"
-    yield Note("memory", {"promised": max_allocation, "held": largest, "free": free, "stopped": end_reason})
+    yield Note("memory", {"promised": max_allocation, "held": tested_size, "free": free_memory, "stopped": end_reason})
 
 
 def _check_buffer(device: Device, size: int) -> Results:
@@ -154,6 +153,6 @@ def yardsticks(device: Device, rng: np.random.Generator) -> Results:
 @SPEED.add()
 def speed(device: Device, rng: np.random.Generator) -> Results:
     peaks = measure_peaks(device, repeats=2)
-    bench = bench_case(device, *BENCH, load("splat").settings)
+    bench = make_case(device, *BENCH, load("splat").settings)
     result = run_bench({"": bench}, Peaks(**asdict(peaks)), repeats=5)[""]
     yield Note("speed", {"scene": BENCH, "peaks": asdict(peaks), **asdict(result)})

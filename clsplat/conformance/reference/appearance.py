@@ -128,8 +128,8 @@ def apply_response_backward(
     light, grad_light, grad_row = image * falloff, np.zeros(image.shape), np.zeros(17)
     for i in range(3):
         slopes = _slopes(row, i)
-        begin, d = _locate_quarter(light[i])
-        grad_light[i] = gradient[i] * (slopes[begin] + 4 * (slopes[begin + 1] - slopes[begin]) * d)
+        quarter, d = _locate_quarter(light[i])
+        grad_light[i] = gradient[i] * (slopes[quarter] + 4 * (slopes[quarter + 1] - slopes[quarter]) * d)
         grad_slope = np.array([(gradient[i] * _curve(light[i], unit)).sum() for unit in np.eye(5)])
         areas = np.array([_curve(np.ones(1), unit)[0] for unit in np.eye(5)])
         grad_logs = (np.diag(slopes) - np.outer(slopes, areas * slopes)).T @ grad_slope

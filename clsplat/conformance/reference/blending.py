@@ -18,7 +18,7 @@ from clsplat.conformance.reference.projection import project
 Floats = NDArray[Any]
 SLOPE, CUBIC, QUINTIC = 1.5957691, 0.07333173, -0.00059424  # Φ(x) = 1 / (1 + e^-P), P = SLOPE x + CUBIC x³ + …
 REACH = 6.0  # standard deviations beyond which Φ is constant
-UNIFORM = 0.4  # half a pixel in standard deviations below which mean and variance use series
+UNIFORM = 0.4  # half a pixel, in standard deviations, below which mean and variance are computed as series
 STEP = 1e-5  # step of finite differences, px or px², relative to the size of the splat
 
 
@@ -41,15 +41,15 @@ def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
 
     dy: at least 0, in px; s: standard deviation, in px.
     """
-    below, above = -(dy + 0.5) / s, -(dy - 0.5) / s  # mirrored, where Φ is small and exact
-    mass = np.maximum(cdf(above) - cdf(below), 1e-30)
+    low, high = -(dy + 0.5) / s, -(dy - 0.5) / s  # mirrored to the side where Φ is small and precise
+    mass = np.maximum(cdf(high) - cdf(low), 1e-30)
     if 0.5 / s < UNIFORM:
         tilt = dy / s**2
         mean = dy - tilt * (1 / 12 - 1 / (360 * s**2) - tilt**2 / 720)
         return mass, mean, np.maximum(1 / 12 - 1 / (360 * s**2) - tilt**2 / 240, 0)
-    below, above = np.clip(below, -REACH, REACH), np.clip(above, -REACH, REACH)
-    mean = (density(below) - density(above)) / mass
-    variance = 1 + (below * density(below) - above * density(above)) / mass - mean**2
+    low, high = np.clip(low, -REACH, REACH), np.clip(high, -REACH, REACH)
+    mean = (density(low) - density(high)) / mass
+    variance = 1 + (low * density(low) - high * density(high)) / mass - mean**2
     return mass, np.clip(-mean * s, dy - 0.5, dy + 0.5), np.clip(variance * s**2, 0, 1 / 12)
 
 
@@ -72,22 +72,22 @@ def box_response(covariance: Floats, dx: Floats, dy: Floats) -> Floats:
 def box_derivatives(covariance: Floats, dx: Floats, dy: Floats) -> tuple[Floats, ...]:
     """Return the derivatives with respect to dx, dy, xx, xy, yy, by central differences."""
 
-    def change(size: float, **unit: float) -> Floats:
+    def difference(step: float, **unit: float) -> Floats:
         values = []
         for sign in (1, -1):
-            v = covariance + sign * size * np.array([unit.get("xx", 0), unit.get("xy", 0), unit.get("yy", 0)])
-            values.append(box_response(v, dx + sign * size * unit.get("x", 0), dy + sign * size * unit.get("y", 0)))
-        return (values[0] - values[1]) / (2 * size)
+            v = covariance + sign * step * np.array([unit.get("xx", 0), unit.get("xy", 0), unit.get("yy", 0)])
+            values.append(box_response(v, dx + sign * step * unit.get("x", 0), dy + sign * step * unit.get("y", 0)))
+        return (values[0] - values[1]) / (2 * step)
 
     xx, xy, yy = covariance
     distance = STEP * np.sqrt(xx - xy * xy / yy)
     area = STEP * (xx * yy - xy * xy) / max(xx, yy)
     return (
-        change(distance, x=1),
-        change(distance, y=1),
-        change(area, xx=1),
-        change(area, xy=1),
-        change(area, yy=1),
+        difference(distance, x=1),
+        difference(distance, y=1),
+        difference(area, xx=1),
+        difference(area, xy=1),
+        difference(area, yy=1),
     )
 
 
@@ -99,10 +99,10 @@ class BlendStep(NamedTuple):
     dy: NDArray[Any]
     falloff: NDArray[Any]  # e^-σ
     alpha: NDArray[Any]
-    before: NDArray[Any]  # transmittance in front of the splat
-    tried: NDArray[Any]  # whether the pixel had not stopped before
-    candidate: NDArray[Any]  # whether it was tried, and the splat is not too faint
-    blended: NDArray[Any]  # whether it is a candidate that does not stop the pixel
+    transmittance: NDArray[Any]  # in front of the splat
+    is_active: NDArray[Any]  # whether the pixel had not stopped before the splat
+    is_candidate: NDArray[Any]  # whether it is active, and the splat is not too faint
+    is_blended: NDArray[Any]  # whether it is a candidate, and the splat does not stop it
 
 
 def depth_order(splats: Splats) -> NDArray[Any]:
@@ -115,7 +115,7 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
     """Yield the blending of each splat, front to back."""
     pixel_x, pixel_y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     transmittance = np.ones((height, width))
-    running = np.ones((height, width), bool)
+    is_active = np.ones((height, width), bool)
     for i in depth_order(splats):
         a, b, c = splats.conic[i]
         dx, dy = splats.mean2d[i, 0] - pixel_x, splats.mean2d[i, 1] - pixel_y
@@ -123,12 +123,12 @@ def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds)
         falloff = box_response(splats.conic[i], dx, dy) if splats.pixel_box else np.exp(-sigma)
         alpha = np.minimum(thresholds.alpha_max, splats.opacity[i] * falloff)
         after = transmittance * (1 - alpha)
-        candidate = running & (sigma >= 0) & (alpha >= thresholds.alpha_min)
-        stops = candidate & (after < thresholds.transmittance_min)
-        blended = candidate & ~stops
-        yield BlendStep(i, dx, dy, falloff, alpha, transmittance, running, candidate, blended)
-        running = running & ~stops
-        transmittance = np.where(blended, after, transmittance)
+        is_candidate = is_active & (sigma >= 0) & (alpha >= thresholds.alpha_min)
+        stops = is_candidate & (after < thresholds.transmittance_min)
+        is_blended = is_candidate & ~stops
+        yield BlendStep(i, dx, dy, falloff, alpha, transmittance, is_active, is_candidate, is_blended)
+        is_active = is_active & ~stops
+        transmittance = np.where(is_blended, after, transmittance)
 
 
 def background_planes(background: NDArray[Any]) -> NDArray[Any]:
@@ -145,10 +145,10 @@ def blend(
     transmittance = np.ones((height, width))
     count = np.zeros((height, width), int)
     for step in blend_steps(splats, width, height, thresholds):
-        weight = np.where(step.blended, step.alpha * step.before, 0)
+        weight = np.where(step.is_blended, step.alpha * step.transmittance, 0)
         image += splats.color[step.splat][:, None, None] * weight
-        transmittance = np.where(step.blended, step.before * (1 - step.alpha), transmittance)
-        count += step.blended
+        transmittance = np.where(step.is_blended, step.transmittance * (1 - step.alpha), transmittance)
+        count += step.is_blended
     return image + background_planes(background) * transmittance, transmittance, count
 
 
@@ -156,7 +156,7 @@ def blend_weights(splats: Splats, width: int, height: int, thresholds: Threshold
     """Return the contribution of each splat to each pixel, α T, [N,H,W]."""
     weights = np.zeros((len(splats.opacity), height, width))
     for step in blend_steps(splats, width, height, thresholds):
-        weights[step.splat] = np.where(step.blended, step.alpha * step.before, 0)
+        weights[step.splat] = np.where(step.is_blended, step.alpha * step.transmittance, 0)
     return weights
 
 
@@ -184,13 +184,13 @@ def alpha_gradients(
     through_background = (background_planes(background) * grad_image).sum(axis=0)
     behind = image - background_planes(background) * final  # S_N - S_i, after subtracting splat i
     for step in blend_steps(splats, width, height, thresholds):
-        i, alpha, before = step.splat, step.alpha, step.before
+        i, alpha, before = step.splat, step.alpha, step.transmittance
         color = splats.color[i][:, None, None]
-        behind = behind - color * np.where(step.blended, alpha * before, 0)
+        behind = behind - color * np.where(step.is_blended, alpha * before, 0)
         grad_alpha = np.sum((color * before - behind / (1 - alpha)) * grad_image, axis=0)
         grad_alpha -= final / (1 - alpha) * through_background
         is_capped = splats.opacity[i] * step.falloff > thresholds.alpha_max
-        yield step, np.where(step.blended & ~is_capped, grad_alpha, 0)
+        yield step, np.where(step.is_blended & ~is_capped, grad_alpha, 0)
 
 
 def blend_backward(
@@ -206,7 +206,7 @@ def blend_backward(
     grad = SplatGradients(np.zeros((n, 2)), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 2)))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         i = step.splat
-        grad.color[i] = np.sum(grad_image * np.where(step.blended, step.alpha * step.before, 0), axis=(1, 2))
+        grad.color[i] = np.sum(grad_image * np.where(step.is_blended, step.alpha * step.transmittance, 0), axis=(1, 2))
         grad.opacity[i] = np.sum(step.falloff * grad_alpha)
         if splats.pixel_box:
             grads = splats.opacity[i] * grad_alpha * np.array(box_derivatives(splats.conic[i], step.dx, step.dy))
@@ -253,10 +253,10 @@ def margin(splats: Splats, width: int, height: int, thresholds: Thresholds = Thr
     alpha, transmittance, cap = [np.inf], [np.inf], [np.inf]
     for step in blend_steps(splats, width, height, thresholds):
         uncapped = splats.opacity[step.splat] * step.falloff
-        cap.append(_relative_gap(uncapped[step.candidate], thresholds.alpha_max))
-        alpha.append(_relative_gap(step.alpha[step.tried], thresholds.alpha_min))
-        after = step.before * (1 - step.alpha)
-        transmittance.append(_relative_gap(after[step.candidate], thresholds.transmittance_min))
+        cap.append(_relative_gap(uncapped[step.is_candidate], thresholds.alpha_max))
+        alpha.append(_relative_gap(step.alpha[step.is_active], thresholds.alpha_min))
+        after = step.transmittance * (1 - step.alpha)
+        transmittance.append(_relative_gap(after[step.is_candidate], thresholds.transmittance_min))
     depth = splats.depth[depth_order(splats)]
     gap = np.min(np.diff(depth) / depth[1:], initial=np.inf)
     return Margin(min(alpha), min(transmittance), min(cap), float(gap))
@@ -271,7 +271,7 @@ class RenderOutput(NamedTuple):
 
     image: NDArray[Any]  # [3,H,W]
     transmittance: NDArray[Any]  # [H,W]
-    blended: NDArray[Any]  # [H,W] number of splats
+    splat_count: NDArray[Any]  # [H,W] number of blended splats
     splats: Splats
 
 
@@ -311,8 +311,8 @@ def median_depth(splats: Splats, width: int, height: int) -> tuple[Floats, Float
     """Return the depth of the splat that takes the transmittance T below ½, or 0, and the least |T - ½|, both [H,W]."""
     depth, gap = np.zeros((height, width)), np.full((height, width), 0.5)
     for step in blend_steps(splats, width, height, Thresholds()):
-        after = step.before * np.where(step.blended, 1 - step.alpha, 1)
-        depth = np.where((step.before >= 0.5) & (after < 0.5), splats.depth[step.splat], depth)
+        after = step.transmittance * np.where(step.is_blended, 1 - step.alpha, 1)
+        depth = np.where((step.transmittance >= 0.5) & (after < 0.5), splats.depth[step.splat], depth)
         gap = np.minimum(gap, np.abs(after - 0.5))
     return depth, gap
 

@@ -83,7 +83,7 @@ def dssim(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def ms_ssim(x: NDArray[Any], y: NDArray[Any], scales: int) -> float:
-    """Return MS-SSIM (Wang et al. 2003) over complete windows, with weights that are divided by their sum."""
+    """Return MS-SSIM (Wang et al. 2003) over complete windows, with weights normalized to a sum of 1."""
     weights = np.array([0.0448, 0.2856, 0.3001, 0.2363, 0.1333])[:scales]
     window = np.outer(ssim_taps(), ssim_taps())
     channels, products = len(x), np.ones(len(x))
@@ -153,8 +153,8 @@ def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
 def haar_filter(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[Any]:
     """Analyze and synthesize an image along both axes.
 
-    Images of odd size repeat the last line.  Masked pixels are replaced with the mean of their 2 x 2 block.
-    image: [3, H, W]; taps: [2]; mask: [H, W] bool.
+    Images of odd size are padded with their last row or column.  Masked pixels are replaced with the mean of their
+    2 x 2 block.  image: [3, H, W]; taps: [2]; mask: [H, W] bool.
     """
     _, height, width = image.shape
     odd = ((0, height % 2), (0, width % 2))
@@ -201,15 +201,15 @@ def residual_histogram(values: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def mask_transients(
-    values: NDArray[Any], counted: NDArray[np.bool_], threshold: float, reach: int
+    values: NDArray[Any], unmasked: NDArray[np.bool_], threshold: float, reach: int
 ) -> NDArray[np.bool_]:
     """Return a mask, [H, W], of the pixels that are not transient.
 
     Their residuals, or at least half of the residuals in the box around them, are below the threshold.
     """
-    mask = counted & (values < threshold)
+    mask = unmasked & (values < threshold)
     is_below = mask.copy()
-    for y, x in zip(*np.nonzero(counted & ~is_below), strict=True):
+    for y, x in zip(*np.nonzero(unmasked & ~is_below), strict=True):
         box = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
-        mask[y, x] = 2 * is_below[box].sum() >= counted[box].sum()
+        mask[y, x] = 2 * is_below[box].sum() >= unmasked[box].sum()
     return mask

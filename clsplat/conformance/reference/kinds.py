@@ -12,7 +12,7 @@ RADIUS_TILE = 16  # px, tile of the original visibility test; kernels may use ot
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The thresholds of blending (Kerbl et al. 2023).  With `SMOOTH`, none is skipped; images are differentiable."""
+    """The thresholds of blending (Kerbl et al. 2023).  `SMOOTH` skips no splat, so images are differentiable."""
 
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99

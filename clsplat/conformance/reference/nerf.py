@@ -103,11 +103,11 @@ class Composite:
 
 BLUR_PADDING, WEIGHT_FLOOR = 0.01, 1e-5  # alpha of equation 18; smallest sum in the released code
 MAX_UNIT = 1 - float(np.finfo(np.float32).eps)
-PIXELS, COARSE, FINE = 8, 9, 10  # kinds of random numbers, see cl_kernels/rays.cl
+PIXELS, COARSE, FINE = 8, 9, 10  # streams of random numbers, see cl_kernels/rays.cl
 
 
 def draw_pixels(count: int, rays: int, first: int, seed: int, step: int) -> NDArray[np.int64]:
-    """Draw the index of a pixel, below `count`, for each ray of a step, [rays].  first: the index of the first ray."""
+    """Draw a pixel index below `count` for each ray of a step, [rays].  first: the index of the first ray."""
     return np.array([philox((first + i, step, PIXELS, 0), (seed, 0))[0] * count >> 32 for i in range(rays)], np.int64)
 
 
@@ -125,9 +125,9 @@ def cones(camera: PinholeCamera, pixels: NDArray[np.int64], unit: float = 1.0) -
     return np.concatenate([origins, directions, radii, np.linalg.norm(directions, axis=1, keepdims=True)], axis=1)
 
 
-def random_units(ray: int, count: int, kind: int, seed: int, step: int) -> Floats:
+def uniform_numbers(ray: int, count: int, stream: int, seed: int, step: int) -> Floats:
     """Return random numbers in (0, 1] for the edges of a ray, [count]."""
-    words = [word for block in range(-(-count // 4)) for word in philox((ray, step, kind, block), (seed, 0))]
+    words = [word for block in range(-(-count // 4)) for word in philox((ray, step, stream, block), (seed, 0))]
     return (np.array(words[:count], np.float64) // 256 + 1) / 2**24
 
 
@@ -144,8 +144,8 @@ def coarse_edges(near: float, far: float, samples: int, offsets: Floats | None =
 def fine_edges(edges: Floats, weights: Floats, samples: int, offsets: Floats | None = None) -> Floats:
     """Return the edges of a ray's fine samples, [samples + 1], distributed by the coarse weights (equation 18)."""
     padded = np.concatenate([weights[:1], weights, weights[-1:]])
-    largest = np.maximum(padded[:-1], padded[1:])
-    blurred = (largest[:-1] + largest[1:]) / 2 + BLUR_PADDING
+    maxima = np.maximum(padded[:-1], padded[1:])
+    blurred = (maxima[:-1] + maxima[1:]) / 2 + BLUR_PADDING
     blurred = blurred + max(0.0, WEIGHT_FLOOR - blurred.sum()) / len(blurred)
     distribution = np.concatenate([[0.0], np.cumsum(blurred / blurred.sum())])
     distribution[-1] = 1.0

@@ -103,37 +103,37 @@ class Footprint:
     point: NDArray[Any]  # [3] camera space
     rotation: NDArray[Any]  # [3,3] R
     scale: NDArray[Any]  # [3] s
-    filtered: NDArray[Any]  # [3] s' = sqrt(s² + f)
+    filtered_scale: NDArray[Any]  # [3] s' = sqrt(s² + f)
     covariance: NDArray[Any]  # [3,3] Σ
     jacobian: NDArray[Any]  # [2,3] J
-    sharp: NDArray[Any]  # [2,2] V, before the screen filter
-    dilated: NDArray[Any]  # [2,2] V1 = V + variance I
+    cov2d: NDArray[Any]  # [2,2] V, before the screen filter
+    filtered_cov2d: NDArray[Any]  # [2,2] V1 = V + variance I
 
 
-def footprint(gaussians: RawGaussians, n: int, camera: PinholeCamera, variance: float) -> Footprint:
+def project_covariance(gaussians: RawGaussians, n: int, camera: PinholeCamera, variance: float) -> Footprint:
     """Project the covariance of Gaussian `n` (EWA splatting), with the 3D filter; variance: screen filter, px²."""
     point = camera.rotation @ gaussians.means[n] + camera.translation
     rotation = rotation_matrix(gaussians.quats[n])
     scale = np.exp(gaussians.log_scales[n])
-    filtered = np.sqrt(scale**2 + gaussians.filter_variance[n])
-    covariance = rotation @ np.diag(filtered**2) @ rotation.T
+    filtered_scale = np.sqrt(scale**2 + gaussians.filter_variance[n])
+    covariance = rotation @ np.diag(filtered_scale**2) @ rotation.T
     (tx, ty), z = clamped_ray(camera, point), point[2]
     fx, fy = camera.fx, camera.fy
     jacobian = np.array([[fx / z, 0, -fx * tx / z**2], [0, fy / z, -fy * ty / z**2]])
     m = jacobian @ camera.rotation
-    sharp = m @ covariance @ m.T
-    dilated = sharp + variance * np.eye(2)
-    return Footprint(point, rotation, scale, filtered, covariance, jacobian, sharp, dilated)
+    cov2d = m @ covariance @ m.T
+    filtered_cov2d = cov2d + variance * np.eye(2)
+    return Footprint(point, rotation, scale, filtered_scale, covariance, jacobian, cov2d, filtered_cov2d)
 
 
-def opacity_factors(logit: float, foot: Footprint, compensate: float) -> tuple[float, float, float]:
+def opacity_factors(logit: float, footprint: Footprint, compensate: float) -> tuple[float, float, float]:
     """Return sigmoid(logit), ρ of the 3D filter, and κ of the screen filter (1 if `compensate` is 0).
 
     Their product is the opacity that is blended.
     """
-    ratio = max(0.0, determinant(foot.sharp) / determinant(foot.dilated))  # rounding may give -1e-17
+    ratio = max(0.0, determinant(footprint.cov2d) / determinant(footprint.filtered_cov2d))  # not -1e-17
     kappa = np.sqrt(1 + compensate * (ratio - 1))
-    return 1 / (1 + np.exp(-logit)), np.prod(foot.scale / foot.filtered), kappa
+    return 1 / (1 + np.exp(-logit)), np.prod(footprint.scale / footprint.filtered_scale), kappa
 
 
 def view_direction(camera: PinholeCamera, mean: NDArray[Any]) -> tuple[NDArray[Any], Any]:
@@ -149,11 +149,11 @@ def unclamped_color(gaussians: RawGaussians, n: int, camera: PinholeCamera, degr
     return basis @ gaussians.sh[n, : len(basis)] + 0.5
 
 
-def vanilla_radius(mean2d: NDArray[Any], dilated: NDArray[Any], width: int, height: int) -> float:
+def vanilla_radius(mean2d: NDArray[Any], cov2d: NDArray[Any], width: int, height: int) -> float:
     """Return the radius of 3DGS, three standard deviations in px, or 0 if the splat reaches no tile."""
-    mean_variance = (dilated[0, 0] + dilated[1, 1]) / 2
-    largest = mean_variance + np.sqrt(max(0.1, mean_variance**2 - determinant(dilated)))
-    radius = np.ceil(3 * np.sqrt(largest))
+    mean_variance = (cov2d[0, 0] + cov2d[1, 1]) / 2
+    max_variance = mean_variance + np.sqrt(max(0.1, mean_variance**2 - determinant(cov2d)))
+    radius = np.ceil(3 * np.sqrt(max_variance))
     index = mean2d - 0.5  # the reference implementation counts pixels from their centers
     grid = np.ceil(np.array([width, height]) / RADIUS_TILE)
     first = np.clip(np.trunc((index - radius) / RADIUS_TILE), 0, grid)
@@ -191,22 +191,22 @@ def project(
         z = camera.rotation[2] @ gaussians.means[n] + camera.translation[2]
         if not z >= near or np.sum(gaussians.quats[n] ** 2) < 1e-12:
             continue
-        foot = footprint(gaussians, n, camera, variance)
-        det = determinant(foot.dilated)
+        footprint = project_covariance(gaussians, n, camera, variance)
+        det = determinant(cov2d := footprint.filtered_cov2d)
         if not det > 0:
             continue
-        x, y, z = foot.point
+        x, y, z = footprint.point
         mean2d = np.array([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy])
-        splats.radius[n] = vanilla_radius(mean2d, foot.dilated, camera.width, camera.height)
-        opacity = gaussians.opacity_factor * np.prod(opacity_factors(gaussians.logit_opacity[n], foot, compensate))
-        brightest = opacity * min(1, 2 * np.pi * np.sqrt(det)) if pixel_box else opacity
-        if not brightest > thresholds.alpha_min:
+        splats.radius[n] = vanilla_radius(mean2d, cov2d, camera.width, camera.height)
+        opacity = gaussians.opacity_factor * np.prod(opacity_factors(gaussians.logit_opacity[n], footprint, compensate))
+        max_alpha = opacity * min(1, 2 * np.pi * np.sqrt(det)) if pixel_box else opacity
+        if not max_alpha > thresholds.alpha_min:
             continue
         splats.visible[n] = True
         splats.mean2d[n] = mean2d
-        splats.conic[n] = np.array([foot.dilated[1, 1], -foot.dilated[0, 1], foot.dilated[0, 0]]) / det
+        splats.conic[n] = np.array([cov2d[1, 1], -cov2d[0, 1], cov2d[0, 0]]) / det
         if pixel_box:
-            splats.conic[n] = foot.sharp[0, 0], foot.sharp[0, 1], foot.sharp[1, 1]
+            splats.conic[n] = footprint.cov2d[0, 0], footprint.cov2d[0, 1], footprint.cov2d[1, 1]
         splats.opacity[n] = opacity
         splats.color[n] = np.maximum(0, unclamped_color(gaussians, n, camera, degree))
         splats.depth[n] = z
@@ -230,15 +230,15 @@ def quat_gradient(quat: NDArray[Any], h: NDArray[Any]) -> NDArray[Any]:
 
 
 def point_gradient(
-    camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any]
+    camera: PinholeCamera, footprint: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any]
 ) -> NDArray[Any]:
     """Return dL/d(camera-space point), [3], through the screen position and the Jacobian J with its clamped ray."""
-    x, y, z = foot.point
+    x, y, z = footprint.point
     fx, fy = camera.fx, camera.fy
     gu, gv = grad_mean2d
     gx, gy = fx / z * gu, fy / z * gv
     gz = -(fx * x * gu + fy * y * gv) / z**2 - fx / z**2 * grad_j[0, 0] - fy / z**2 * grad_j[1, 1]
-    tx, ty = clamped_ray(camera, foot.point)
+    tx, ty = clamped_ray(camera, footprint.point)
     (x_low, x_high), (y_low, y_high) = ray_limits(camera)
     if x_low <= x / z <= x_high:
         gx += -fx / z**2 * grad_j[0, 2]
@@ -253,14 +253,14 @@ def point_gradient(
     return np.array([gx, gy, gz])
 
 
-def ratio_gradient(foot: Footprint) -> NDArray[Any]:
+def ratio_gradient(footprint: Footprint) -> NDArray[Any]:
     """Return d(det V / det V1)/dV, [2, 2], where V1 is V plus a constant."""
-    det0, det1 = determinant(foot.sharp), determinant(foot.dilated)
-    return adjugate(foot.sharp) / det1 - det0 / det1**2 * adjugate(foot.dilated)
+    det0, det1 = determinant(footprint.cov2d), determinant(footprint.filtered_cov2d)
+    return adjugate(footprint.cov2d) / det1 - det0 / det1**2 * adjugate(footprint.filtered_cov2d)
 
 
 def covariance_gradient(
-    splats: Splats, n: int, foot: Footprint, compensate: float, grad_conic: NDArray[Any], grad_kappa: float
+    splats: Splats, n: int, footprint: Footprint, compensate: float, grad_conic: NDArray[Any], grad_kappa: float
 ) -> NDArray[Any]:
     """Return dL/dV, [2, 2], from the gradients of the conic and of κ = sqrt(1 + compensate (det V / det V1 - 1))."""
     # Conic -> 2D covariance: G_V = -K G_K K (for the pixel's box, V is given directly)
@@ -271,8 +271,8 @@ def covariance_gradient(
     if not splats.pixel_box:
         grad_v = -conic @ grad_v @ conic
     if compensate != 0:
-        _, _, kappa = opacity_factors(0.0, foot, compensate)
-        grad_v += grad_kappa * compensate / (2 * kappa) * ratio_gradient(foot)
+        _, _, kappa = opacity_factors(0.0, footprint, compensate)
+        grad_v += grad_kappa * compensate / (2 * kappa) * ratio_gradient(footprint)
     return grad_v
 
 
@@ -291,21 +291,21 @@ def project_backward(
     """Return the gradients of `PARAMETERS` by name, zero for culled Gaussians; `filter_variance` is a constant."""
     grad = {name: np.zeros_like(getattr(gaussians, name)) for name in PARAMETERS}
     for n in np.flatnonzero(splats.visible).tolist():
-        foot = footprint(gaussians, n, camera, variance)
+        footprint = project_covariance(gaussians, n, camera, variance)
 
         # Opacity o = sigmoid * ρ * κ, with the constant in ρ
-        sigmoid, rho, kappa = opacity_factors(gaussians.logit_opacity[n], foot, compensate)
+        sigmoid, rho, kappa = opacity_factors(gaussians.logit_opacity[n], footprint, compensate)
         rho = rho * gaussians.opacity_factor
         grad["logit_opacity"][n] = grad_opacity[n] * rho * kappa * sigmoid * (1 - sigmoid)
         grad_kappa = grad_opacity[n] * sigmoid * rho
 
-        grad_v = covariance_gradient(splats, n, foot, compensate, grad_conic[n], grad_kappa)
+        grad_v = covariance_gradient(splats, n, footprint, compensate, grad_conic[n], grad_kappa)
 
         # 2D -> 3D covariance: V = M Σ Mᵀ, M = J W
-        m = foot.jacobian @ camera.rotation
+        m = footprint.jacobian @ camera.rotation
         grad_sigma = m.T @ grad_v @ m
-        grad_j = 2 * grad_v @ m @ foot.covariance @ camera.rotation.T
-        grad_point = point_gradient(camera, foot, grad_mean2d[n], grad_j)
+        grad_j = 2 * grad_v @ m @ footprint.covariance @ camera.rotation.T
+        grad_point = point_gradient(camera, footprint, grad_mean2d[n], grad_j)
 
         # Color: SH, its direction, max(0, .)
         direction, distance = view_direction(camera, gaussians.means[n])
@@ -318,11 +318,11 @@ def project_backward(
         grad["means"][n] = camera.rotation.T @ grad_point + (grad_d - direction * (direction @ grad_d)) / distance
 
         # Σ = L Lᵀ, L = R diag(s'); s' = sqrt(s² + f) is also part of ρ = Π s/s'
-        grad_l = 2 * grad_sigma @ foot.rotation @ np.diag(foot.filtered)
-        grad["quats"][n] = quat_gradient(gaussians.quats[n], grad_l @ np.diag(foot.filtered))
-        grad_filtered = np.sum(foot.rotation * grad_l, axis=0)
-        through_covariance = grad_filtered * foot.scale**2 / foot.filtered
-        through_rho = grad_opacity[n] * splats.opacity[n] * gaussians.filter_variance[n] / foot.filtered**2
+        grad_l = 2 * grad_sigma @ footprint.rotation @ np.diag(footprint.filtered_scale)
+        grad["quats"][n] = quat_gradient(gaussians.quats[n], grad_l @ np.diag(footprint.filtered_scale))
+        grad_filtered = np.sum(footprint.rotation * grad_l, axis=0)
+        through_covariance = grad_filtered * footprint.scale**2 / footprint.filtered_scale
+        through_rho = grad_opacity[n] * splats.opacity[n] * gaussians.filter_variance[n] / footprint.filtered_scale**2
         grad["log_scales"][n] = through_covariance + through_rho
     return grad
 
@@ -331,7 +331,11 @@ def project_backward(
 
 
 def sampling_interval(
-    means: NDArray[Any], cameras: list[PinholeCamera], focal: list[float], near: float = 0.2, margin: float = 0.15
+    means: NDArray[Any],
+    cameras: list[PinholeCamera],
+    focal_lengths: list[float],
+    near: float = 0.2,
+    margin: float = 0.15,
 ) -> NDArray[Any]:
     """Return the smallest depth / focal length over the cameras in which each mean is visible, [N].
 
@@ -339,7 +343,7 @@ def sampling_interval(
     """
     intervals = np.full(len(means), np.inf)
     for n, mean in enumerate(means):
-        for camera, f in zip(cameras, focal, strict=True):
+        for camera, focal in zip(cameras, focal_lengths, strict=True):
             x, y, z = camera.rotation @ mean + camera.translation
             if not z > near:
                 continue
@@ -348,7 +352,7 @@ def sampling_interval(
                 -margin * camera.width <= u <= (1 + margin) * camera.width
                 and -margin * camera.height <= v <= (1 + margin) * camera.height
             ):
-                intervals[n] = min(intervals[n], z / f)
+                intervals[n] = min(intervals[n], z / focal)
     is_visible = np.isfinite(intervals)
     intervals[~is_visible] = intervals[is_visible].max(initial=0)
     return intervals
@@ -357,10 +361,10 @@ def sampling_interval(
 # Gradients of the pose and the focal length of a camera, one Gaussian after another, in camera axes.
 
 
-def move_camera(camera: PinholeCamera, shift: NDArray[Any], turn: NDArray[Any], zoom: float = 0.0) -> PinholeCamera:
-    """Return the camera with W' = exp([turn]x) W, t' = exp([turn]x) t + shift, and focal lengths times exp(zoom)."""
-    angle = np.linalg.norm(turn)
-    x, y, z = turn
+def move_camera(camera: PinholeCamera, shift: NDArray[Any], rotvec: NDArray[Any], zoom: float = 0.0) -> PinholeCamera:
+    """Return the camera with W' = R W, t' = R t + shift, R = exp([rotvec]x), and focal lengths times exp(zoom)."""
+    angle = np.linalg.norm(rotvec)
+    x, y, z = rotvec
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     rotation = np.eye(3)
     if angle > 0:
@@ -383,20 +387,20 @@ def pose_gradient(
     grad_opacity: NDArray[Any],
     grad_color: NDArray[Any],
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return dL/d(shift) and dL/d(turn), each [3], and dL/d(zoom), [1], of `move_camera` at zero."""
-    grad_shift, grad_turn, grad_zoom = np.zeros(3), np.zeros(3), np.zeros(1)
+    """Return dL/d(shift) and dL/d(rotvec), each [3], and dL/d(zoom), [1], of `move_camera` at zero."""
+    grad_shift, grad_rotvec, grad_zoom = np.zeros(3), np.zeros(3), np.zeros(1)
     for n in np.flatnonzero(splats.visible).tolist():
-        foot = footprint(gaussians, n, camera, variance)
-        sigmoid, rho, _ = opacity_factors(gaussians.logit_opacity[n], foot, compensate)
+        footprint = project_covariance(gaussians, n, camera, variance)
+        sigmoid, rho, _ = opacity_factors(gaussians.logit_opacity[n], footprint, compensate)
         grad_kappa = grad_opacity[n] * sigmoid * rho * gaussians.opacity_factor
-        grad_v = covariance_gradient(splats, n, foot, compensate, grad_conic[n], grad_kappa)
-        g = 2 * grad_v @ foot.jacobian @ camera.rotation @ foot.covariance @ camera.rotation.T
-        grad_point = point_gradient(camera, foot, grad_mean2d[n], g)
+        grad_v = covariance_gradient(splats, n, footprint, compensate, grad_conic[n], grad_kappa)
+        g = 2 * grad_v @ footprint.jacobian @ camera.rotation @ footprint.covariance @ camera.rotation.T
+        grad_point = point_gradient(camera, footprint, grad_mean2d[n], g)
 
-        # x_c' = exp([turn]x) x_c + shift, and M = J W: dL/d(turn) = <G_J, J [turn]x>
-        j = foot.jacobian
-        grad_turn += np.cross(foot.point, grad_point)
-        grad_turn += [
+        # x_c' = exp([rotvec]x) x_c + shift, and M = J W: dL/d(rotvec) = <G_J, J [rotvec]x>
+        j = footprint.jacobian
+        grad_rotvec += np.cross(footprint.point, grad_point)
+        grad_rotvec += [
             j[0, 2] * g[0, 1] + j[1, 2] * g[1, 1] - j[1, 1] * g[1, 2],
             j[0, 0] * g[0, 2] - j[0, 2] * g[0, 0] - j[1, 2] * g[1, 0],
             j[1, 1] * g[1, 0] - j[0, 0] * g[0, 1],
@@ -408,20 +412,20 @@ def pose_gradient(
         basis_gradient = sh_basis_gradient(direction, degree)
         grad_d = basis_gradient.T @ (gaussians.sh[n, : len(basis_gradient)] @ grad_c)
         grad_shift += grad_point + camera.rotation @ (grad_d - direction * (direction @ grad_d)) / distance
-        grad_zoom += camera.fx * focal_gradient(camera, foot, grad_mean2d[n], g, 0)
-        grad_zoom += camera.fy * focal_gradient(camera, foot, grad_mean2d[n], g, 1)
-    return grad_shift, grad_turn, grad_zoom
+        grad_zoom += camera.fx * focal_gradient(camera, footprint, grad_mean2d[n], g, 0)
+        grad_zoom += camera.fy * focal_gradient(camera, footprint, grad_mean2d[n], g, 1)
+    return grad_shift, grad_rotvec, grad_zoom
 
 
 def focal_gradient(
-    camera: PinholeCamera, foot: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any], axis: int
+    camera: PinholeCamera, footprint: Footprint, grad_mean2d: NDArray[Any], grad_j: NDArray[Any], axis: int
 ) -> float:
     """Return dL/dfx (axis 0) or dL/dfy (axis 1), through the screen position and the Jacobian J.
 
     The limits of rays are proportional to 1/f, so J02 = -f limit/z of a clamped ray does not depend on f.
     """
-    z = foot.point[2]
-    ray = foot.point[axis] / z
+    z = footprint.point[2]
+    ray = footprint.point[axis] / z
     low, high = ray_limits(camera)[axis]
     is_inside = low <= ray <= high
     return float(grad_mean2d[axis] * ray + grad_j[axis, axis] / z - (ray / z * grad_j[axis, 2] if is_inside else 0.0))

@@ -18,8 +18,8 @@ def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
     """Return the directions through the centers of pixels, [H, W, 3], in the scene."""
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
-    in_camera = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
-    return in_camera @ camera.world_to_camera[:, :3]  # each row times the rotation, which is the inverse rotation
+    camera_rays = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
+    return camera_rays @ camera.world_to_camera[:, :3]  # each row times the rotation, which is the inverse rotation
 
 
 def map_entries(direction: NDArray[Any], side: int) -> Iterator[Entry]:
@@ -72,7 +72,7 @@ def sky_mask(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> 
     return np.asarray(counts) >= 6
 
 
-def sky_cover(chosen: NDArray[Any], transmittance: NDArray[Any], weight: float) -> tuple[float, NDArray[Any]]:
+def sky_cover(mask: NDArray[Any], transmittance: NDArray[Any], weight: float) -> tuple[float, NDArray[Any]]:
     """Return the loss of Gaussians that cover the sky, and its gradient with respect to the transmittance, [H, W]."""
-    mean_weights = chosen / chosen.size
+    mean_weights = mask / mask.size
     return float(weight * (mean_weights * (1 - transmittance)).sum()), -weight * mean_weights

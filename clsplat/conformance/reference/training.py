@@ -20,20 +20,20 @@ def adam_step(
     beta1: float = 0.9,
     beta2: float = 0.999,
     epsilon: float = 1e-15,
-    seen: NDArray[Any] | None = None,
+    mask: NDArray[Any] | None = None,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return the new parameter and moments (Kingma and Ba 2015), with epsilon outside the root, as in PyTorch.
 
-    step: number of the update, from 1; seen: mask of the rows to update, [N], or None for all.
+    step: number of the update, from 1; mask: the rows to update, [N], or None for all.
     """
     first = beta1 * moment1 + (1 - beta1) * grad
     second = beta2 * moment2 + (1 - beta2) * grad**2
     mean = first / (1 - beta1**step)
     square = second / (1 - beta2**step)
     new_parameter = parameter - rate * mean / (np.sqrt(square) + epsilon)
-    if seen is None:
+    if mask is None:
         return new_parameter, first, second
-    rows = seen.reshape(-1, *[1] * (grad.ndim - 1))
+    rows = mask.reshape(-1, *[1] * (grad.ndim - 1))
     return np.where(rows, new_parameter, parameter), np.where(rows, first, moment1), np.where(rows, second, moment2)
 
 
@@ -41,25 +41,26 @@ def adam_step(
 
 
 def covariance_trace(
-    log_scales: NDArray[Any], above: NDArray[Any] | float, extent: float
+    log_scales: NDArray[Any], threshold: NDArray[Any] | float, extent: float
 ) -> tuple[float, NDArray[Any]]:
-    """Return the mean of max(sum of squared scales - above, 0) / extent².  log_scales: [N, 3]; above: scene units²."""
+    """Return the mean of max(sum of squared scales - threshold, 0) / extent².  log_scales: [N, 3]; threshold: scene
+    units²."""
     scale2 = np.exp(2 * log_scales)
-    excess = scale2.sum(axis=1) - above
+    excess = scale2.sum(axis=1) - threshold
     is_above = (excess > 0)[:, None]
     return np.maximum(excess, 0).mean() / extent**2, 2 * scale2 * is_above / len(scale2) / extent**2
 
 
-def anisotropy(log_scales: NDArray[Any], above: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of max(longest / shortest axis - above, 0).  log_scales: [N, 3]."""
+def anisotropy(log_scales: NDArray[Any], threshold: float) -> tuple[float, NDArray[Any]]:
+    """Return the mean of max(longest / shortest axis - threshold, 0).  log_scales: [N, 3]."""
     rows = np.arange(len(log_scales))
     longest, shortest = log_scales.argmax(axis=1), log_scales.argmin(axis=1)
     ratio = np.exp(log_scales[rows, longest] - log_scales[rows, shortest])
-    slope = np.where(ratio > above, ratio, 0) / len(rows)
+    slope = np.where(ratio > threshold, ratio, 0) / len(rows)
     gradient = np.zeros_like(log_scales)
     gradient[rows, longest] += slope
     gradient[rows, shortest] -= slope
-    return np.maximum(ratio - above, 0).mean(), gradient
+    return np.maximum(ratio - threshold, 0).mean(), gradient
 
 
 def mean_scale(log_scales: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
@@ -82,11 +83,11 @@ def opacity_pressure(logit_opacity: NDArray[Any], floor: float) -> tuple[float, 
 
 # Density control: which Gaussians are cloned, split and pruned, and their children.
 
-KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # rows afterwards: itself; itself twice; two children; none
+KEEP, CLONE, SPLIT, PRUNE = 0, 1, 2, 3  # the Gaussian becomes itself; itself twice; two children; nothing
 
 
 @dataclass(frozen=True)
-class DensityRule:
+class DensityConstants:
     """The constants of density control.  Lengths are fractions of the scene extent."""
 
     clone_gradient: float = 2e-4
@@ -97,7 +98,7 @@ class DensityRule:
     split_factor: float = 1.6
 
 
-VANILLA = DensityRule()
+VANILLA = DensityConstants()
 
 
 def screen_gradient(grad_mean2d: NDArray[Any], width: int, height: int) -> NDArray[Any]:
@@ -130,26 +131,26 @@ def adc_actions(
     opacity: NDArray[Any],
     extent: float,
     prune_large: bool,
-    rule: DensityRule = VANILLA,
+    rule: DensityConstants = VANILLA,
     split_gradient: NDArray[Any] | None = None,
 ) -> NDArray[Any]:
     """Return KEEP, CLONE, SPLIT or PRUNE for each Gaussian, [N].
 
     Pruning is last, and applies to the new rows: copies and children have their parent's opacity, and children its
-    scale / 1.6.  split_gradient: the statistic for splits, if it differs, such as the absolute gradient.
+    scale / 1.6.  split_gradient: the statistic for splits, if it is another, such as the absolute gradient.
     """
     split_gradient = gradient if split_gradient is None else split_gradient
     actions = []
     for g, g_split, scale, o in zip(gradient, split_gradient, max_scale, opacity, strict=True):
-        small = scale <= rule.dense * extent
+        is_small = scale <= rule.dense * extent
         action = KEEP
-        if small and g >= rule.clone_gradient:
+        if is_small and g >= rule.clone_gradient:
             action = CLONE
-        elif not small and g_split >= rule.split_gradient:
+        elif not is_small and g_split >= rule.split_gradient:
             action = SPLIT
         final_scale = scale / rule.split_factor if action == SPLIT else scale
-        too_large = prune_large and final_scale > rule.prune_scale * extent
-        actions.append(PRUNE if o < rule.min_opacity or too_large else action)
+        is_too_large = prune_large and final_scale > rule.prune_scale * extent
+        actions.append(PRUNE if o < rule.min_opacity or is_too_large else action)
     return np.array(actions, int)
 
 
@@ -162,9 +163,9 @@ def shared_logit(logit: NDArray[Any], rows: int) -> NDArray[Any]:
     return np.log(-np.expm1(log_transmittance)) - log_transmittance
 
 
-def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, ceiling: float = 0.01) -> NDArray[Any]:
-    """Return logits, [N], whose opacities are at most `ceiling` after multiplication by the filter's `filter_ratio`."""
-    opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), ceiling) / filter_ratio
+def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, limit: float = 0.01) -> NDArray[Any]:
+    """Return logits, [N], whose opacities are at most `limit` after multiplication by the filter's `filter_ratio`."""
+    opacity = np.minimum(filter_ratio / (1 + np.exp(-logit)), limit) / filter_ratio
     return np.log(opacity / (1 - opacity))
 
 
@@ -198,12 +199,12 @@ def mean_jacobian(camera: PinholeCamera, mean: NDArray[Any]) -> NDArray[Any]:
     return perspective @ camera.rotation
 
 
-def splitting(gaussians: RawGaussians, camera: PinholeCamera, on_screen: NDArray[Any]) -> NDArray[Any]:
+def splitting(gaussians: RawGaussians, camera: PinholeCamera, screen_matrices: NDArray[Any]) -> NDArray[Any]:
     """Convert matrices on the screen, [N, 2, 2], to matrices in the scene, [N, 3, 3], for constant splat shapes."""
-    matrices = np.zeros((len(on_screen), 3, 3))
-    for n in np.flatnonzero(on_screen.any(axis=(1, 2))):
+    matrices = np.zeros((len(screen_matrices), 3, 3))
+    for n in np.flatnonzero(screen_matrices.any(axis=(1, 2))):
         jacobian = mean_jacobian(camera, gaussians.means[n])
-        matrices[n] = jacobian.T @ on_screen[n] @ jacobian
+        matrices[n] = jacobian.T @ screen_matrices[n] @ jacobian
     return matrices
 
 
