@@ -63,7 +63,7 @@ class SampleLevel:
 
 @dataclass(frozen=True)
 class RayTarget:
-    """The photograph that rays are compared with."""
+    """The photo that rays are compared with."""
 
     photograph: Array  # [3, rows, stride]
     scale: float  # factor on a ray's squared difference in the loss

@@ -60,7 +60,7 @@ class LearnedField(TrainedField):
         self._beta1, self._beta2 = constants("adam.h")["BETA1"], constants("adam.h")["BETA2"]
         self.updates = 0  # number of updates so far, for the bias correction of the moments
         self.rate = 0.0  # rate of the last step
-        self._scales: list[tuple[int, float]] = []  # rays and factor on squared differences, by photograph of last step
+        self._scales: list[tuple[int, float]] = []  # rays and factor on squared differences, by photo of the last step
 
     @classmethod
     def initial(cls, shape: FieldShape, seed: int, background: Array) -> "LearnedField":

@@ -34,7 +34,7 @@ SOLID = 0.5  # opacity of the Gaussians that may be ground
 
 @dataclass(frozen=True)
 class AlignOptions:
-    """What is known about a scene."""
+    """The options of an alignment, which state what is known about a scene."""
 
     level: Level | None = None  # where the up direction comes from
     distances: tuple[str, ...] = ()  # scale bars, see clsplat/scene/control.py
@@ -52,7 +52,7 @@ class AlignOptions:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is aligned: a scene, a model, or both.  Their coordinates are relative to the same origin."""
+    """The scene, the model, or both, to align.  Their coordinates are relative to the same origin."""
 
     path: Path
     scene: Scene | None = None
@@ -93,14 +93,14 @@ class Subject:
         if source == "cameras":
             views = self.require_scene("--level cameras").views
             return up_direction(views), np.median([view.position for view in views], axis=0), None
-        expected = up_direction(self.scene.views) if self.scene else UP
+        expected_up = up_direction(self.scene.views) if self.scene else UP
         if self.model is not None:
             points = self.model.scene_means[self.model.opacities[: len(self.model.scene_means)] >= SOLID]
         elif self.scene and self.scene.points:
             points = self.scene.points.positions
         else:
             raise DataError(f"{self.path}: has no points to find the ground in; use --level cameras")
-        up, height = ground_plane(points, expected)
+        up, height = ground_plane(points, expected_up)
         return up, np.median(points, axis=0).astype(np.float64), height
 
 
@@ -109,7 +109,7 @@ class Residual:
     """The error of a point after the alignment, in the unit of its known coordinates."""
 
     name: str
-    position: list[float]  # as aligned
+    position: list[float]  # after the alignment
     error: list[float]  # aligned minus known coordinates
     distance: float  # length of `error`
     is_outlier: bool
@@ -118,7 +118,7 @@ class Residual:
 
 @dataclass(frozen=True)
 class Alignment:
-    """The transform from the world coordinates of a scene to its new ones, and the errors that remain."""
+    """The transform from the world coordinates of a scene to its new coordinates, and the remaining errors."""
 
     transform: Similarity
     residuals: list[Residual]
@@ -130,11 +130,9 @@ class Alignment:
         """Find the transform.  Raises ConfigError, DataError."""
         points = read_control(options.control) if options.control else {}
         bars = [ScaleBar.parse(text, points) for text in options.distances]
-        measured, lengths = (
-            np.array([bar.measure(subject.scene) for bar in bars]),
-            np.array([bar.length for bar in bars]),
-        )
-        scale = float(lengths @ measured / (measured @ measured)) if bars else None
+        bar_lengths = np.array([bar.measure(subject.scene) for bar in bars])
+        lengths = np.array([bar.length for bar in bars])
+        scale = float(lengths @ bar_lengths / (bar_lengths @ bar_lengths)) if bars else None
         up, anchor, height = subject.up(options.level) if options.level else (UP, np.zeros(3), None)
         targets = _gps_targets(subject) if options.gps else _control_targets(subject, options.control, points)
         if targets.names:
@@ -149,18 +147,18 @@ class Alignment:
             raise DataError(f"{options.control}: no point has x, y, and z; add them, or use --distance between points")
         rows = [
             {"distance": bar.text, "length": bar.length, "measured": transform.scale * value}
-            for bar, value in zip(bars, measured.tolist(), strict=True)
+            for bar, value in zip(bars, bar_lengths.tolist(), strict=True)
         ]
         return cls(transform, residuals, rows, targets.epsg)
 
     def data(self) -> dict[str, Any]:
         """Return the alignment as JSON values."""
-        used = [residual.distance for residual in self.residuals if not residual.is_outlier]
+        inlier_distances = [residual.distance for residual in self.residuals if not residual.is_outlier]
         return {
             "scale": self.transform.scale,
             "matrix": self.transform.matrix.tolist(),
             "epsg": self.epsg,
-            "rms": math.sqrt(sum(d**2 for d in used) / len(used)) if used else None,
+            "rms": math.sqrt(sum(d**2 for d in inlier_distances) / len(inlier_distances)) if inlier_distances else None,
             "outliers": [residual.name for residual in self.residuals if residual.is_outlier],
             "points": [asdict(residual) for residual in self.residuals],
             "distances": self.bars,
@@ -230,12 +228,12 @@ def align(
     subject = Subject.read(path, scene, is_model)
     if not is_model:
         if subject.scene is None:
-            raise ConfigError(f"{out}: is the name of a folder, and {path} a model; use a name that ends in .ply")
+            raise ConfigError(f"{out}: is the name of a folder, and {path} is a model; use a name that ends in .ply")
         alignment = Alignment.solve(subject, options)
         files = write_cameras(alignment.transform.transform_scene(subject.scene), out, format_, images)
         return {**alignment.data(), "files": [str(file) for file in files]}
     if subject.model is None:
-        raise ConfigError(f"{out}: is the name of a model, and {path} a scene; use the name of a folder")
+        raise ConfigError(f"{out}: is the name of a model, and {path} is a scene; use the name of a folder")
     check_output([path], out)
     alignment = Alignment.solve(subject, options)
     transform = alignment.transform
