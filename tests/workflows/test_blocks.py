@@ -334,7 +334,7 @@ def test_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
     result = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "2"])
     assert result.exit_code == 0, result.output
     names = [line.split()[0] for line in result.stdout.splitlines() if "%" in line]
-    assert names == ["block_00", "block_01", "whole"]
+    assert names == ["block_00", "block_01", "scene"]
     assert "estimated time" in result.stdout
     assert all(re.search(r"\d min", line) for line in result.stdout.splitlines() if "%" in line)
     refused = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "3"])
