@@ -159,7 +159,7 @@ def find_variant(name: PathLike, key: Literal["short", "draft", "high"]) -> str:
     """Return the name or path of a variant of a pipeline, such as `photos_high`.  Raises ConfigError if it has none."""
     from clsplat.pipeline import files
 
-    return files.variant_of(str(name), key)
+    return files.variant_name(str(name), key)
 
 
 def copy_pipeline(name: PathLike, file: PathLike) -> Path:

@@ -138,24 +138,24 @@ def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath,
 
 
 def _describe_error(error: dict[str, Any], key_path: KeyPath, model: type[BaseModel] | None, annotation: Any) -> str:
-    kind, value = error["type"], error["input"]
-    if kind == "extra_forbidden":
+    error_type, value = error["type"], error["input"]
+    if error_type == "extra_forbidden":
         if advice := getattr(model, "unavailable", {}).get(key_path[-1]):
             return str(advice)
         keys = [name for name in (model.model_fields if model else {}) if name not in TAGS]
         return f"unknown key {quote(key_path[-1])}{_nearest(str(key_path[-1]), keys)}"
-    if kind == "missing":
+    if error_type == "missing":
         return f"'{key_path[-1]}' is missing"
-    if kind == "union_tag_invalid":
+    if error_type == "union_tag_invalid":
         names = [tag.strip().strip("'") for tag in error["ctx"]["expected_tags"].split(",")]
         tag = shorten(str(error["ctx"]["tag"]))
         return f"no {_describe_kind(annotation)} named '{tag}'{_nearest(tag, names)}; plug-ins need --plugin FILE.py"
-    if kind == "union_tag_not_found":
+    if error_type == "union_tag_not_found":
         tag = Variants(bases(annotation)[0]).tag
         return f"expected a '{tag}', the name of the {_describe_kind(annotation)}"
     suffix = f", got {quote(value)}"
-    if kind in EXPECTATIONS:
-        return f"expected {EXPECTATIONS[kind].format(**error.get('ctx', {}))}{suffix}"
+    if error_type in EXPECTATIONS:
+        return f"expected {EXPECTATIONS[error_type].format(**error.get('ctx', {}))}{suffix}"
     message = error["msg"].removeprefix("Value error, ")
     message = f"{message[:1].lower()}{message[1:]}"
     return message if isinstance(value, dict | list) else message + suffix

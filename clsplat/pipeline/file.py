@@ -105,7 +105,7 @@ class SceneSettings(Settings):
 
 
 class RasterizerSettings(Settings):
-    """How the device renders.  Results do not depend on it, unless growth stops because its memory is full."""
+    """How the device renders.  Results do not depend on these keys, unless growth stops because memory is full."""
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"harmonics"})
 
@@ -182,8 +182,8 @@ class PipelineFile(Settings):
                     if name in other_settings.conflict_names() and not is_elsewhere:
                         label = getattr(settings, "type", getattr(settings, "stage", path))
                         remedy = "" if ";" in reason else "; leave one of them out"
-                        text = f"{path}: '{label}' cannot be combined with {name} ({other_path}): {reason}{remedy}"
-                        raise ConfigError(text)
+                        message = f"{path}: '{label}' cannot be combined with {name} ({other_path}): {reason}{remedy}"
+                        raise ConfigError(message)
 
     @property
     def harmonics(self) -> Harmonics:
@@ -192,8 +192,8 @@ class PipelineFile(Settings):
         `auto` becomes `device` at degree 0, or if a stage needs them on the device.
         """
         harmonics = self.rasterizer.harmonics
-        is_needed = any(ON_HOST in settings.active_conflicts() for _, settings in iter_settings(self.stages))
-        return "device" if harmonics == "auto" and (self.model.sh_degree == 0 or is_needed) else harmonics
+        needs_device = any(ON_HOST in settings.active_conflicts() for _, settings in iter_settings(self.stages))
+        return "device" if harmonics == "auto" and (self.model.sh_degree == 0 or needs_device) else harmonics
 
     @property
     def training(self) -> Training:

@@ -29,8 +29,8 @@ def shipped_pipelines() -> dict[str, Path]:
 def origin(path: Path) -> Path:
     """Return the file on disk that defines a pipeline: NAME.yaml for NAME_7k.yaml if only the first exists."""
     key = variant_key(path)
-    full = path.with_stem(path.stem.removesuffix(ENDINGS[key])) if key else path
-    return full if full != path and full.is_file() and not path.exists() else path
+    base = path.with_stem(path.stem.removesuffix(ENDINGS[key])) if key else path
+    return base if base != path and base.is_file() and not path.exists() else path
 
 
 def variant_key(path: Path) -> str | None:
@@ -38,7 +38,7 @@ def variant_key(path: Path) -> str | None:
     return next((key for key, ending in ENDINGS.items() if path.stem.endswith(ending) and path.stem != ending), None)
 
 
-def variant_of(name: str, key: str) -> str:
+def variant_name(name: str, key: str) -> str:
     """Return the name or path of a variant, given those of its pipeline.  Raises ConfigError."""
     path = find(name)
     if key.encode() not in VARIANT_KEY.findall(read_file(origin(path), "a pipeline file", ConfigError)):

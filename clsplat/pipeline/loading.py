@@ -138,9 +138,9 @@ def _validate(data: dict[str, Any], path: Path, document: Document) -> PipelineF
         settings.check_conflicts()
     except ConfigError as error:
         raise ConfigError(f"{path}: {one_line(error)}") from error
-    nested = [inner for _, inner in iter_settings(settings)]
-    kinds = {*map(type, nested), *(kind for inner in nested if isinstance(inner, Rule) for kind in inner.columns)}
-    return settings.model_copy(update={"plugins": plugins.used_by(kinds)})
+    nested = [item for _, item in iter_settings(settings)]
+    classes = {*map(type, nested), *(class_ for item in nested if isinstance(item, Rule) for class_ in item.columns)}
+    return settings.model_copy(update={"plugins": plugins.used_by(classes)})
 
 
 def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
@@ -173,7 +173,7 @@ def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, doc
 # Settings that follow from the photos.  They are decided once, as if by `--set`, and again if the photos change.
 
 AUTO = ("chosen", "reason")  # keys that a run writes next to `auto`
-LENGTHS = ("near", "unit")  # keys that a run replaces by lengths if they are `auto`
+LENGTHS = ("near", "unit")  # keys that a run replaces with lengths if they are `auto`
 
 
 def apply_adaptation(pipeline: Pipeline, measures: Measures) -> Pipeline:
@@ -310,12 +310,12 @@ def _explain_late_stage(stages: Sequence[Stage], need: str) -> str:
 
 def _check_order(path: Path, settings: PipelineFile) -> None:
     """Raise ConfigError if a stage needs something, such as a model, that no earlier stage makes."""
-    available, removed, step = {"scene"}, dict[str, str](), 0
+    available_items, removed, step = {"scene"}, dict[str, str](), 0
     for i, stage in enumerate(settings.stages):
         for key in CADENCE if isinstance(stage, Scheduled) else ():
             if getattr(stage, key) != type(stage).model_fields[key].default:
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage}: '{key}' belongs inside optimize.during")
-        for need in sorted(stage.needs - available):
+        for need in sorted(stage.needs - available_items):
             makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
             if need in removed:
                 reason = f"which {removed[need]} removes; add {makers} in between"
@@ -324,10 +324,10 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {reason}")
             reason = f"no earlier stage creates; add {makers} before it"
             raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', which {reason}")
-        removed |= dict.fromkeys(available & stage.removes, f"stages[{i}] {stage.stage}")
-        available = (available - stage.removes) | stage.makes
+        removed |= dict.fromkeys(available_items & stage.removes, f"stages[{i}] {stage.stage}")
+        available_items = (available_items - stage.removes) | stage.makes
         if isinstance(stage, Training):
-            available.update(output for inner in stage.active_stages(step) for output in inner.makes)
+            available_items.update(output for inner in stage.active_stages(step) for output in inner.makes)
             step += stage.steps
     if file := find_output_conflict(settings.stages):
         raise ConfigError(f"{path}: two stages write '{file}'; give one of them another name")

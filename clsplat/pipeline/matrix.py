@@ -34,7 +34,7 @@ from clsplat.pipeline.loading import Pipeline, check_document
 from clsplat.pipeline.stretching import stretch_to_steps
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_pipeline, read_yaml, yaml_text
 
-# Short labels for the values of a matrix, of which the names of its cells consist.
+# Short labels for the values of a matrix, from which the names of its cells are built.
 
 
 def shortest_labels(paths: Sequence[tuple[str, ...]]) -> list[str]:
@@ -70,7 +70,7 @@ class Matrix(Settings):
     steps: Annotated[int, Field(ge=1)] | None = None
     """Steps of each cell's training; schedules are stretched to fit; default: as in the pipelines."""
     options: list[str] = Field([])
-    """Settings of all cells, as key=value.  A run writes those of --set and --scene here, in its folder."""
+    """Settings of all cells, as key=value.  In the copy of this file in its folder, a run adds --set and --scene."""
 
     @model_validator(mode="after")
     def _check_axes(self) -> "Matrix":
@@ -243,7 +243,7 @@ def _check_overrides(path: Path, axes: Sequence[Sequence[_Choice]], overrides: S
     swept_keys = {choice.override.partition("=")[0] for axis in axes for choice in axis}
     for override in overrides:
         if (key_path := override.partition("=")[0]) in swept_keys:
-            raise ConfigError(f"{path}: the matrix lists values of {key_path}; change them there, not by an option")
+            raise ConfigError(f"{path}: the matrix already lists values of {key_path}; change that list instead")
 
 
 def _check_names(path: Path, cells: Sequence[Cell]) -> None:

@@ -53,7 +53,7 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> KeyPath:
         node.put(last, new_value, text)
         return (*node.key_path, last)
     if isinstance(node.data, list):
-        i = node.number(last, text)
+        i = node.index(last, text)
         node.data[i] = with_tags(new_value, node.items)
         return (*node.key_path, i)
     if not isinstance(node.data, dict):
@@ -92,7 +92,7 @@ class _Node:
             item = next(item for item in self.data if item["type"] == name)
             return _Node(item, self.items, (*self.key_path, name))
         if isinstance(self.data, list):
-            return self._item(self.number(name, text))
+            return self._item(self.index(name, text))
         if not isinstance(self.data, dict):
             raise NoSuchKey(text, f"{quote(self.key_path[-1])} has no keys")
         if stage := self._stage(name, text):
@@ -119,11 +119,11 @@ class _Node:
 
         Raises OverrideError.
         """
-        kinds: dict[str, Any] = {key: kind for base in bases(self.items) for key, kind in variants(base).items()}
-        if name not in kinds:
-            matches = difflib.get_close_matches(name, kinds, n=1)
+        classes: dict[str, Any] = {key: class_ for base in bases(self.items) for key, class_ in variants(base).items()}
+        if name not in classes:
+            matches = difflib.get_close_matches(name, classes, n=1)
             hint = f"; did you mean {matches[0]}?" if matches else ""
-            raise OverrideError(text, f"unknown type {quote(name)}; expected one of {', '.join(kinds)}{hint}")
+            raise OverrideError(text, f"unknown type {quote(name)}; expected one of {', '.join(classes)}{hint}")
         if value is not None and not isinstance(value, dict):
             raise OverrideError(text, "expected a mapping of keys to values, such as {}, or null")
         types = [item["type"] for item in self.data]
@@ -133,11 +133,11 @@ class _Node:
         if value is None:
             return
         if index is None:
-            index = sum(getattr(kinds.get(type_), "order", 0) <= kinds[name].order for type_ in types)
+            index = sum(getattr(classes.get(type_), "order", 0) <= classes[name].order for type_ in types)
         item = {"type": name, **{key: setting for key, setting in value.items() if key != "type"}}
         self.data.insert(index, with_tags(item, self.items))
 
-    def number(self, name: str, text: str) -> int:
+    def index(self, name: str, text: str) -> int:
         """Parse a name as an index of the list.  Raises OverrideError."""
         if re.fullmatch(r"[0-9]{1,9}", name) and int(name) < len(self.data):
             return int(name)
@@ -206,13 +206,13 @@ def _address(key_path: KeyPath) -> str:
 def suggestion(names: Sequence[str], key_paths: Sequence[str]) -> str:
     """Return '; did you mean …?' with the key paths that end with `names` or resemble them, or '' if none do."""
     key_path = ".".join(names)
-    similar = [path for path in key_paths if path.endswith(f".{key_path}")]
-    similar = similar or difflib.get_close_matches(key_path, key_paths, n=1)
-    similar = similar or [path for path in key_paths if path.rpartition(".")[2] == names[-1]]
-    if not similar:
-        last = difflib.get_close_matches(names[-1], [path.rpartition(".")[2] for path in key_paths], n=1)
-        similar = [path for path in key_paths if path.rpartition(".")[2] in last]
-    return f"; did you mean {' or '.join(similar[:MAX_SUGGESTIONS])}?" if similar else ""
+    similar_paths = [path for path in key_paths if path.endswith(f".{key_path}")]
+    similar_paths = similar_paths or difflib.get_close_matches(key_path, key_paths, n=1)
+    similar_paths = similar_paths or [path for path in key_paths if path.rpartition(".")[2] == names[-1]]
+    if not similar_paths:
+        similar_names = difflib.get_close_matches(names[-1], [path.rpartition(".")[2] for path in key_paths], n=1)
+        similar_paths = [path for path in key_paths if path.rpartition(".")[2] in similar_names]
+    return f"; did you mean {' or '.join(similar_paths[:MAX_SUGGESTIONS])}?" if similar_paths else ""
 
 
 # The keys of a pipeline that `--set` can change, in its syntax.

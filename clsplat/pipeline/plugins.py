@@ -37,7 +37,7 @@ class Plugin:
     name: str  # name of the file without .py, or of the entry point
     path: Path
     digest: str  # SHA-256 of its Python files, the kernel files that they name, and the headers of the kernels
-    installed: bool  # from a package rather than --plugin
+    is_installed: bool  # from a package rather than --plugin
     kinds: tuple[type, ...]  # its classes of settings and readers
 
 
@@ -52,7 +52,7 @@ def load_file(path: Path) -> Plugin:
             raise ConfigError(
                 f"--plugin {path}: another plug-in named '{path.stem}' is loaded, from {plugin.path}; rename the file"
             )
-        if plugin.digest != digest_of(path, *_imported_files(sys.modules[name], path.parent)):
+        if plugin.digest != hash_plugin_files(path, *_imported_files(sys.modules[name], path.parent)):
             raise ConfigError(f"--plugin {path}: its files have changed since it was loaded; restart Python")
         return plugin
     spec = importlib.util.spec_from_file_location(name, path)
@@ -61,8 +61,8 @@ def load_file(path: Path) -> Plugin:
     with _importing(name, path) as kinds:
         module = sys.modules[name] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-    digest = digest_of(path, *_imported_files(module, path.parent))
-    _loaded[path.stem] = Plugin(path.stem, path, digest, installed=False, kinds=tuple(kinds))
+    digest = hash_plugin_files(path, *_imported_files(module, path.parent))
+    _loaded[path.stem] = Plugin(path.stem, path, digest, is_installed=False, kinds=tuple(kinds))
     return _loaded[path.stem]
 
 
@@ -88,20 +88,23 @@ def used_by(kinds: Collection[type]) -> dict[str, str]:
     return {
         plugin.name: plugin.digest
         for plugin in loaded_plugins()
-        if not plugin.installed or any(kind in bases or not issubclass(kind, Settings) for kind in plugin.kinds)
+        if not plugin.is_installed or any(kind in bases or not issubclass(kind, Settings) for kind in plugin.kinds)
     }
 
 
-def require(recorded: Mapping[str, str], source: str) -> None:
-    """Raise ConfigError if a recorded plug-in is not loaded or has changed; `source` is the file with the record."""
-    if faults := differences(recorded):
+def require(digests: Mapping[str, str], source: str) -> None:
+    """Raise ConfigError if a recorded plug-in is not loaded or has changed.
+
+    digests: content hashes by name.  source: the file that contains them.
+    """
+    if faults := differences(digests):
         raise ConfigError(f"{source}: {faults[0]}")
 
 
-def differences(recorded: Mapping[str, str]) -> list[str]:
+def differences(digests: Mapping[str, str]) -> list[str]:
     """Return a sentence for each recorded plug-in that is not loaded or has changed."""
     faults = []
-    for name, digest in recorded.items():
+    for name, digest in digests.items():
         if name not in _loaded:
             faults.append(f"needs the plug-in '{name}', which is not loaded; use --plugin {name}.py")
         elif _loaded[name].digest != digest:
@@ -111,7 +114,7 @@ def differences(recorded: Mapping[str, str]) -> list[str]:
     return faults
 
 
-def digest_of(*modules: Path) -> str:
+def hash_plugin_files(*modules: Path) -> str:
     """Return the SHA-256 of Python files, and of the kernel files and headers next to them that they refer to."""
     digest, queue = sha256(), list(dict.fromkeys(modules))
     visited_files = set(queue)
@@ -133,10 +136,10 @@ def _load_entry(entry: EntryPoint) -> Plugin:
         package = _root_package(module)
         path = Path(module.__file__ or entry.module)
         files = sorted(path for folder in getattr(package, "__path__", ()) for path in Path(folder).rglob("*.py"))
-        digest = digest_of(path, *files)
+        digest = hash_plugin_files(path, *files)
     all_kinds = [kind for classes in _class_lists() for kind in classes]  # another plug-in may have imported the module
     package_kinds = [kind for kind in all_kinds if _is_within(kind.__module__, package.__name__)]
-    return Plugin(entry.name, path, digest, installed=True, kinds=tuple(dict.fromkeys([*kinds, *package_kinds])))
+    return Plugin(entry.name, path, digest, is_installed=True, kinds=tuple(dict.fromkeys([*kinds, *package_kinds])))
 
 
 @contextmanager

@@ -46,7 +46,7 @@ class Axis:
         return min(math.floor(step * self.factor), MAX_STEP)
 
     def scale_interval(self, every: float) -> float:
-        """Return a stretched interval.  1 stays 1, and intervals never become shorter."""
+        """Return a stretched interval, which is at least 1.  An interval of 1 stays 1."""
         interval = Fraction(str(every)) * self.factor
         if every == 1 or interval <= 1:
             return 1
@@ -79,8 +79,8 @@ class Axis:
         return math.floor(number * Fraction(str(every)) * self.factor)
 
 
-def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
-    """Return settings with another number of training steps, without changing the first `done` steps.
+def with_steps(settings: PipelineFile, steps: int, done_steps: int) -> PipelineFile:
+    """Return settings with another number of training steps, without changing the first `done_steps`.
 
     If `steps` is larger than the last edit, the steps up to that edit do not change either.  Stages that start later
     start at the same fraction of the remaining steps.
@@ -88,7 +88,7 @@ def with_steps(settings: PipelineFile, steps: int, done: int) -> PipelineFile:
 
     def change(training: Training) -> Training:
         last = last_edit(training)
-        fixed_steps = max(done, last) if last < min(steps, training.steps) else done
+        fixed_steps = max(done_steps, last) if last < min(steps, training.steps) else done_steps
         factor = (steps - fixed_steps) / (training.steps - fixed_steps)
         during = [_stretch_stage(stage, fixed_steps, factor) for stage in training.during]
         return training.model_copy(update={"steps": steps, "during": during})
@@ -116,7 +116,7 @@ def min_steps(training: Training) -> int:
     if isinstance(training, Optimize):
         edits |= {int(step) for step in training.views.changes}
     edits |= {rule.start for stage in training.during if isinstance(stage, Densify) for rule in stage.rules}
-    gap = min((later - step for step, later in pairwise(sorted(edits - {0}))), default=training.steps)
+    gap = min((next_step - step for step, next_step in pairwise(sorted(edits - {0}))), default=training.steps)
     return -(-training.steps // gap)
 
 
@@ -125,13 +125,13 @@ def stretch_to_steps(settings: PipelineFile, steps: int) -> PipelineFile:
     return stretch(settings, Fraction(steps, settings.training.steps))
 
 
-def _stretch_stage(stage: Scheduled, fixed: int, factor: float) -> Scheduled:
-    """Return a stage with the steps after `fixed` multiplied by `factor`, if it starts after `fixed`."""
-    if stage.start <= fixed:
+def _stretch_stage(stage: Scheduled, pivot: int, factor: float) -> Scheduled:
+    """Return a stage with the steps after `pivot` multiplied by `factor`, if it starts after `pivot`."""
+    if stage.start <= pivot:
         return stage
     every = max(1, math.floor((stage.every or 1) * factor))
     start, stop = (
-        step if step is None else fixed + math.floor((step - fixed) * factor) for step in (stage.start, stage.stop)
+        step if step is None else pivot + math.floor((step - pivot) * factor) for step in (stage.start, stage.stop)
     )
     return stage.model_copy(update={"every": every, "start": start, "stop": stop})
 

@@ -54,7 +54,7 @@ class _BadValue(Exception):
         self.line = node.start_mark.line + 1
 
 
-class _Bounded(Composer):
+class _BoundedComposer(Composer):
     """A composer that fails as soon as a limit is exceeded; parsing time grows with the square of the depth."""
 
     def __init__(self, loader: Any = None) -> None:
@@ -79,7 +79,7 @@ def read_yaml(path: Path) -> Document:
 
 
 def read_pipeline(path: Path) -> str:
-    """Return the text of a pipeline; that of NAME_7k is created from NAME.yaml and its key `short`.
+    """Return the text of a pipeline; the text of NAME_7k is created from NAME.yaml and its key `short`.
 
     Raises ConfigError.
     """
@@ -111,10 +111,10 @@ def _apply_variant(text: str, path: Path, file: Path, name: str) -> str:
             line = f"{file}:{document.line((name, key_path))}: {name}"
             raise ConfigError(f"{line}: the file has no key {quote(key_path)}; expected one of its keys, as for --set")
         edits.append((node.start_mark.index, node.end_mark.index, value))
-    following = len(text)  # start of the next edit: the end mark of a map is behind the comments that follow it
+    next_start = len(text)  # start of the next edit: the end mark of a map is behind the comments that follow it
     for start, stop, new_text in sorted(edits, reverse=True):
-        text = text[:start] + new_text + text[min(stop, following) :]
-        following = start
+        text = text[:start] + new_text + text[min(stop, next_start) :]
+        next_start = start
     return f"{summary}#\n{text}"
 
 
@@ -162,7 +162,7 @@ def yaml_text(data: Any) -> str:
 
 def _parse(text: str, name: str) -> Document:
     yaml = YAML(typ="safe", pure=True)
-    yaml.Composer = _Bounded
+    yaml.Composer = _BoundedComposer
     try:
         root = yaml.compose(text)
         return _Reader(yaml).document(root)
@@ -243,8 +243,8 @@ class _Reader:
         try:
             value = self._scalars.construct_object(node)
         except (ValueError, KeyError, IndexError):
-            kind = str(node.tag).removeprefix(CORE)
-            raise _BadValue(node, f"{quote(node.value)} cannot be read as {kind}") from None
+            type_name = str(node.tag).removeprefix(CORE)
+            raise _BadValue(node, f"{quote(node.value)} cannot be read as {type_name}") from None
         if isinstance(value, int) and abs(value) >= INTEGER_LIMIT:
             raise _BadValue(node, f"{quote(node.value)} is too large; expected a whole number of at most 64 bits")
         return next((type_(value) for type_ in PLAIN_TYPES if isinstance(value, type_)), None)

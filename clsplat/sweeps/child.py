@@ -102,4 +102,4 @@ def _wait(process: "subprocess.Popen[bytes]", attempt: CellAttempt, is_stopped: 
 
 def plugin_files() -> list[Path]:
     """Return the plug-in files that child processes have to load; installed plug-ins are loaded automatically."""
-    return [plugin.path for plugin in plugins.loaded_plugins() if not plugin.installed]
+    return [plugin.path for plugin in plugins.loaded_plugins() if not plugin.is_installed]

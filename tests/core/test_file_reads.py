@@ -13,7 +13,7 @@ from clsplat.core.manifest import Manifest, hash_values
 from clsplat.data_tools.video import write_frames
 from clsplat.pipeline import recipes
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.pipeline.plugins import digest_of
+from clsplat.pipeline.plugins import hash_plugin_files
 from clsplat.runs.status import summary
 from clsplat.scene import identity
 from clsplat.training import archive
@@ -108,7 +108,7 @@ def pipe(tmp_path: Path) -> Path:
 READERS = {
     "a pipeline to copy": (lambda path: recipes.copy(str(path), path.with_name("copy.yaml")), ConfigError),
     "a matrix": (lambda path: load_experiment(str(path)), ConfigError),
-    "a plug-in": (digest_of, ConfigError),
+    "a plug-in": (hash_plugin_files, ConfigError),
     "a video": (lambda path: write_frames(path, path.with_name("frames"), 2), DataError),
     "a file that is hashed": (hash_values, DataError),
     "a checkpoint": (archive.read, ClsplatError),

@@ -142,7 +142,7 @@ def test_refusals(case, write):
 
 
 def test_option_cannot_contradict_the_matrix(write):
-    with pytest.raises(ConfigError, match=r"the matrix lists values of optimize\.steps"):
+    with pytest.raises(ConfigError, match=r"the matrix already lists values of optimize\.steps"):
         load_experiment(write(SMALL), ["optimize.steps=3"])
 
 

@@ -94,11 +94,11 @@ def test_hash_covers_kernels_and_their_headers(tmp_path):
     (tmp_path / "other.cl").write_text('#include "own.h"\n')
     (tmp_path / "own.h").write_text("#define A 1\n")
     (tmp_path / "stranger.cl").write_text("x")
-    before = plugins.digest_of(path)
+    before = plugins.hash_plugin_files(path)
     (tmp_path / "stranger.cl").write_text("y")
-    assert plugins.digest_of(path) == before
+    assert plugins.hash_plugin_files(path) == before
     (tmp_path / "own.h").write_text("#define A 2\n")
-    assert plugins.digest_of(path) != before
+    assert plugins.hash_plugin_files(path) != before
 
 
 @pytest.mark.parametrize(
