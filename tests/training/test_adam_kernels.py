@@ -157,7 +157,7 @@ def test_omitted_parameters_do_not_change(device, rng):
     adam, gradients = Adam(model.gaussians), GaussianGradients(model.gaussians)
     for array in gradients.arrays.values():
         array.fill(1)
-    adam.step(model, frame_of(device, case, model), gradients, Rates().at(1, 1.0), without={"means"})
+    adam.step(model, frame_of(device, case, model), gradients, Rates().at(1, 1.0), frozen={"means"})
     np.testing.assert_array_equal(model.gaussians.get("means"), case.parameters["means"])
     assert adam.updates["means"] == 0
     assert adam.updates["quats"] == 1
