@@ -214,7 +214,7 @@ class _BinaryFile:
         self.offset = self.skip(count * stride, f"{count} {label}")
         return int(count)
 
-    def read_text(self, label: str) -> str:
+    def read_string(self, label: str) -> str:
         """Read UTF-8 text up to the next zero byte."""
         source, end = self.source, self.data.find(b"\0", self.offset)
         start = self.skip((end if end >= 0 else len(self.data)) + 1 - self.offset, label)
@@ -246,7 +246,7 @@ def read_images_binary(path: Path) -> Iterator[ImageRecord]:
     for _ in range(file.read_count(73, "images")):
         source = file.source
         _, *pose, camera = file.read("<I7dI", "an image")
-        name = file.read_text("an image name")
+        name = file.read_string("an image name")
         count = file.read_count(POINT2D.itemsize, "2D points")
         start = file.skip(POINT2D.itemsize * count, "2D points")
         points = np.frombuffer(file.data, POINT2D, count, start)
