@@ -119,7 +119,7 @@ class Change:
     before: int
     after: int
     causes: dict[str, int]  # number of Gaussians with an outcome set by a rule, by the rule's name
-    growth: dict[str, int]  # like causes, but only Gaussians that became several
+    grown: dict[str, int]  # like causes, but only Gaussians that became several
 
 
 def densify(

@@ -243,7 +243,7 @@ def test_children_are_along_the_axis_and_share_opacity(device, rng):
     case = Edited(device, rng, diagonal(matrices))
     change = case.apply(SplitSteepest(distance=0.7, shrink=1.5, eigenvalue_below=-1e-6))
     chosen = least < -1e-6
-    assert (change.before, change.after, change.growth) == (65, 65 + chosen.sum(), {"split_steepest": chosen.sum()})
+    assert (change.before, change.after, change.grown) == (65, 65 + chosen.sum(), {"split_steepest": chosen.sum()})
     own = covariance_matrices(*(case.before[name].astype(np.float64) for name in ("quats", "log_scales")))
     way = 0.7 * np.sqrt(np.einsum("ni,nij,nj->n", axis, own, axis))[:, None] * axis
     opacity = 1 / (1 + np.exp(-case.before["logit_opacity"].astype(np.float64)))
@@ -279,7 +279,7 @@ def test_candidates_exceed_the_gradient_and_are_unselected(device, rng):
     assert [len(case.rows_of(n)) for n in range(40)] == [1, 2] * 20
     case = Edited(device, rng, diagonal(np.full((40, 3), -1.0)))
     change = case.apply(Clone(size_below=1e9), SplitSteepest())
-    assert change.growth == {"clone": 40, "split_steepest": 0}
+    assert change.grown == {"clone": 40, "split_steepest": 0}
     np.testing.assert_array_equal(case.gaussians.get("logit_opacity")[::2], case.before["logit_opacity"])
 
 
