@@ -20,7 +20,7 @@ from tests.support.runs import digest
 
 
 def test_steps_follow_from_a_rehearsal():
-    rehearsal = Rehearsal(200, [0.01, 0.03], during=3.0, after=2.0)
+    rehearsal = Rehearsal(200, [0.01, 0.03], overhead=3.0, after=2.0)
     assert rehearsal.steps_in(25.0) == 1000
     assert rehearsal.steps_in(4.0) == 0
     assert replace(rehearsal, trend=0.5).steps_in(5 + 600 * 0.02 * 3**0.5) == pytest.approx(600, abs=1)
@@ -40,7 +40,7 @@ def test_run_takes_the_given_time(monkeypatch, minutes, growth, until_share):
     def rehearse(pipeline: Pipeline, run: Run, steps: int, *given: float) -> Rehearsal:
         course = [cost(step, steps) for step in range(0, steps, steps // 20)]
         clock[0] += 3 + 2 + steps * sum(course) / len(course)
-        return Rehearsal(steps, course, during=3.0, after=2.0)
+        return Rehearsal(steps, course, overhead=3.0, after=2.0)
 
     def execute(pipeline: Pipeline, run: Run, start: str, show: time_budget.Show) -> None:
         steps = pipeline.settings.training.steps
