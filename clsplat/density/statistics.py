@@ -16,6 +16,7 @@ from clsplat.core.settings import Settings, VariantName, variants
 from clsplat.gaussians.gaussians import Gaussians
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array, constants
+from clsplat.opencl.plan import Plans
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame
 
 PREFIX = "stats/"
@@ -120,6 +121,10 @@ class BlendWeight(Statistic):
 StatisticName = Annotated[str, VariantName(Statistic, lambda cls: cls.components == 1)]
 
 
+# Statistics that only launch kernels, with arguments that depend only on sizes and memory.
+PLANNED = {"screen_grad", "screen_grad_abs", "screen_grad_abs_sum", "texture", "screen_radius", "blend_weight"}
+
+
 class SplatStats:
     """The statistics of a model, and the number of views in which each Gaussian is visible.
 
@@ -131,6 +136,7 @@ class SplatStats:
     ) -> None:
         """Add the tables of `names` and their divisors, and delete all other tables.  Existing sums are kept."""
         self.gaussians, self.training_views = gaussians, training_views
+        self._plans = Plans(gaussians.device)
         classes = variants(Statistic)
         all_names = {*names, *(classes[name].divisor for name in names)}
         self.columns = {name: cls() for name, cls in classes.items() if name in all_names}
@@ -170,12 +176,22 @@ class SplatStats:
 
     def add(self, gradients: ViewGradients, grad_mean2d: Array) -> None:
         """Add a view to all statistics.  grad_mean2d: [2, S] px⁻¹."""
-        gaussians = self.gaussians
-        gaussians.device.program("density.cl").count_seen(
-            items=gaussians.count, radius=gradients.frame.radius, seen=self.view_count, count=gaussians.count
-        )
+        gaussians, frame = self.gaussians, gradients.frame
+
+        def launch() -> None:
+            gaussians.device.program("density.cl").count_seen(
+                items=gaussians.count, radius=frame.radius, seen=self.view_count, count=gaussians.count
+            )
+            for name in filter(PLANNED.__contains__, self.columns):
+                self.columns[name].add(gaussians, gradients, grad_mean2d, self.total(name))
+
+        arrays = grad_mean2d, gradients.pixel_sums, frame.radius
+        size = frame.camera.width, frame.camera.height
+        key = "statistics", gaussians.key, size, *(array.buffer.serial for array in arrays)
+        self._plans.run(key, {}, launch)
         for name, column in self.columns.items():
-            column.add(gaussians, gradients, grad_mean2d, self.total(name))
+            if name not in PLANNED:
+                column.add(gaussians, gradients, grad_mean2d, self.total(name))
 
     def mean(self, name: str) -> NDArray[np.float32]:
         """Return the mean of a scalar statistic, on the host, [N]; 0 where the divisor is 0."""

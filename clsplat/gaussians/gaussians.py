@@ -11,6 +11,7 @@ statistics are all tables, so that their rows always move together.
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,9 @@ class Table:
     zero_fresh: bool  # rows of new Gaussians start at zero instead of copying their source
 
 
+_serial = attrgetter("array.buffer.serial")
+
+
 class Gaussians:
     """The tables of N Gaussians on a device."""
 
@@ -113,6 +117,12 @@ class Gaussians:
         if self.deferred and name in self.deferred.names:
             self.deferred.flush()
         return self.tables[name]
+
+    @property
+    def key(self) -> tuple[int, ...]:
+        """Numbers that identify the memory and the sizes of all tables, as a part of the keys of plans."""
+        slots = (self.on_host.slot.buffer.serial, self.on_host.block_size) if self.on_host else ()
+        return (self.count, self.capacity, *slots, *map(_serial, self.tables.values()))
 
     @property
     def components(self) -> dict[str, int]:
@@ -269,6 +279,12 @@ class DeviceModel:
     pixel_box: float = 0.0  # 1: splats are integrated over the pixel's box instead
     dropout: DropoutMask | None = None  # of this training step
     sky: DeviceSky | None = None  # behind the Gaussians, instead of a background color
+
+    @property
+    def key(self) -> tuple[float, ...]:
+        """Numbers that identify the model, except for its dropout and its sky, as a part of the keys of plans."""
+        screen_filter = self.screen_variance, self.compensate, self.pixel_box
+        return (self.degree, self.near, *screen_filter, *self.gaussians.key)
 
     @property
     def defines(self) -> dict[str, int]:

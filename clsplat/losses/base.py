@@ -35,6 +35,11 @@ class Comparison:
     accumulate: bool = False  # if False, the next loss overwrites the gradient
     depths: KnownDepths | None = None  # at pixels of the photograph, if a loss reads them
 
+    def arguments(self) -> dict[str, Any]:
+        """Return the common arguments of kernels that add the gradient of a loss on colors."""
+        arrays = {"image": self.image, "photograph": self.photograph, "gradient": self.gradient}
+        return {**arrays, "accumulate": int(self.accumulate)}
+
     @property
     def size(self) -> int:
         """The number of values in the image."""

@@ -1,7 +1,7 @@
 """Define the photometric losses L1, L2, and D-SSIM."""
 
 import math
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -49,37 +49,28 @@ class Dssim(ImageLoss):
 
     def add(self, comparison: Comparison) -> LossValue:
         weight = at_step(self.weight, comparison.step)
-        maps, sums = ssim_maps(comparison)
-        comparison.workspace.device.program("loss.cl").ssim_gradient(
-            groups=(-(-comparison.camera.stride // SSIM_BLOCK), comparison.camera.rows, 3),
-            maps=maps,
-            image=comparison.image,
-            photograph=comparison.photograph,
-            gradient=comparison.gradient,
-            scale=-weight / comparison.size,
-            accumulate=int(comparison.accumulate),
-            **comparison.camera.plane_arguments(),
-        )
+        arguments = {**comparison.arguments(), "scale": -weight / comparison.size}
+        key = "dssim", comparison.camera.size
+        sums = comparison.workspace.plans.run(key, arguments, add_ssim_gradient, comparison, arguments)
         comparison.accumulate = True
         return LossValue("dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.size))
 
 
 def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
     """Add the gradient of weighted L1 and L2; return the sums of |x - y| and (x - y)² by row, [3, rows, 2]."""
-    camera, size = comparison.camera, comparison.size
+    size, key = comparison.size, ("pixel loss", comparison.camera.size)
+    arguments = {**comparison.arguments(), "l1": l1 / size, "l2": l2 / size}
+    sums = comparison.workspace.plans.run(key, arguments, _pixel_loss, comparison, arguments)
+    comparison.accumulate = True
+    return sums
+
+
+def _pixel_loss(comparison: Comparison, arguments: dict[str, Any]) -> Array:
+    camera = comparison.camera
     sums = comparison.workspace.array("row_sums", (3, camera.rows, 2))  # identical for all losses of a step
     comparison.workspace.device.program("loss.cl").pixel_loss(
-        groups=(1, camera.rows, 3),
-        image=comparison.image,
-        photograph=comparison.photograph,
-        gradient=comparison.gradient,
-        row_sums=sums,
-        l1=l1 / size,
-        l2=l2 / size,
-        accumulate=int(comparison.accumulate),
-        **comparison.camera.plane_arguments(),
+        groups=(1, camera.rows, 3), row_sums=sums, **arguments, **camera.plane_arguments()
     )
-    comparison.accumulate = True
     return sums
 
 
@@ -105,6 +96,18 @@ def view_error(comparison: Comparison) -> Array:
     )
     program.sum_errors(groups=(1,), row_errors=rows, error=error, count=3 * camera.rows)
     return error
+
+
+def add_ssim_gradient(comparison: Comparison, arguments: dict[str, Any]) -> Array:
+    """Add the gradient of the SSIM, times the argument `scale`; return the sums of `ssim_maps`."""
+    maps, sums = ssim_maps(comparison)
+    comparison.workspace.device.program("loss.cl").ssim_gradient(
+        groups=(-(-comparison.camera.stride // SSIM_BLOCK), comparison.camera.rows, 3),
+        maps=maps,
+        **arguments,
+        **comparison.camera.plane_arguments(),
+    )
+    return sums
 
 
 def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:

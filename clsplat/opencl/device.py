@@ -3,6 +3,7 @@
 Only this package imports pyopencl.
 """
 
+import itertools
 import logging
 import math
 import re
@@ -14,7 +15,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, ClassVar, NoReturn
@@ -84,6 +85,22 @@ class Timings:
 class Buffer(cl.Buffer):
     """A buffer in device memory that, unlike pyopencl's class, supports weak references."""
 
+    serial: int  # no other buffer has the same
+
+
+_SERIALS = itertools.count(1)
+
+
+class Recording(threading.local):
+    """The plan to which a thread's launches are added (`clsplat.opencl.plan`), or None."""
+
+    plan: Any = None
+
+    def spoil(self) -> None:
+        """Note a command that a plan cannot repeat."""
+        if self.plan is not None:
+            self.plan.is_fixed = False
+
 
 class Array:
     """A typed array in device memory, without arithmetic."""
@@ -100,6 +117,7 @@ class Array:
     def get(self) -> NDArray[Any]:
         """Copy the array to the host, after waiting for the device.  Raises MemoryLimitError, DeviceError."""
         host = np.empty(self.shape, self.dtype)
+        self.device.recording.spoil()
         if host.size:
             with self.device.raising_errors("a copy to the host"):
                 cl.enqueue_copy(self.device.queue, host, self.buffer)
@@ -114,6 +132,7 @@ class Array:
         return self._copy_later(np.empty(self.shape, self.dtype))
 
     def _copy_later(self, host: NDArray[Any], **part: Any) -> Callable[[], NDArray[Any]]:
+        self.device.recording.spoil()
         with self.device.raising_errors("a copy to the host"):
             copy = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False, **part)
 
@@ -138,6 +157,7 @@ class Array:
         host = np.ascontiguousarray(values, self.dtype)
         if host.shape != self.shape:
             raise ValueError(f"cannot copy an array of shape {host.shape} into a buffer of shape {self.shape}")
+        self.device.recording.spoil()
         if host.size:
             with self.device.raising_errors("a copy to the device"):
                 cl.enqueue_copy(self.device.queue, self.buffer, host)
@@ -178,6 +198,7 @@ class Device:
         self.allocated = 0  # bytes of all buffers that are alive
         self.peak = 0  # largest value of `allocated`
         self.lock = threading.Lock()  # protects what threads share: programs, and the arguments of their kernels
+        self.recording = Recording()
         self._programs: dict[tuple[Any, ...], Program] = {}
         if self.schedule == "simt":
             self._fit_groups()
@@ -237,6 +258,8 @@ class Device:
                 f"{self.info.name} could not allocate {size / 2**20:.0f} MiB more ({error}); "
                 "use fewer Gaussians or smaller images"
             ) from error
+        buffer.serial = next(_SERIALS)
+        self.recording.spoil()
         self.allocated += size
         self.peak = max(self.peak, self.allocated)
         weakref.finalize(buffer, self._record_release, size)
@@ -407,10 +430,11 @@ def group_multiple(kernel: Any, device: Any) -> int:
 class Kernel:
     """A kernel that is called with named arguments."""
 
-    def __init__(self, device: "Device", label: str, kernel: Any, arguments: list[Argument]) -> None:
+    def __init__(self, device: "Device", label: str, create: Callable[[], Any], arguments: list[Argument]) -> None:
         self.label, self.arguments = label, arguments
-        self._device, self._kernel = device, kernel
-        self._kernel.set_scalar_arg_dtypes([None if a.is_pointer else a.dtype for a in arguments])
+        self.spare: list[Any] = []  # copies of the kernel that no plan uses
+        self._device, self._create = device, create
+        self._kernel = kernel = self.take()
         info, cl_device = cl.kernel_work_group_info, device.context.devices[0]
         self.group = tuple(int(n) for n in kernel.get_work_group_info(info.COMPILE_WORK_GROUP_SIZE, cl_device))
         items, limit = math.prod(self.group), group_limit(kernel, cl_device)
@@ -419,6 +443,14 @@ class Kernel:
                 f"{label} needs work-groups of {items} items, but {device.info.text} allows {limit}; "
                 "use another device, rasterizer.schedule or rasterizer.sort"
             )
+
+    def take(self) -> Any:
+        """Return a copy of the kernel, whose arguments no other launch sets."""
+        if self.spare:
+            return self.spare.pop()
+        kernel = self._create()
+        kernel.set_scalar_arg_dtypes([None if a.is_pointer else a.dtype for a in self.arguments])
+        return kernel
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
         """Launch `items` work-items, rounded up to full work-groups, or `groups` work-groups; none if a size is 0."""
@@ -431,10 +463,12 @@ class Kernel:
             size = tuple(n * g for n, g in zip(size, local, strict=True))
         if 0 in size:
             return
-        arguments = self._check_arguments(values)
+        arguments, plan = self._check_arguments(values), self._device.recording.plan
         with self._device.lock, self._device.raising_errors(self.label):  # arguments must not change until enqueued
-            self._kernel.set_args(*arguments)
-            event = cl.enqueue_nd_range_kernel(self._device.queue, self._kernel, size, local)
+            if plan is None:
+                self._kernel.set_args(*arguments)
+            kernel = plan.add(self, size, local, arguments) if plan else self._kernel
+            event = cl.enqueue_nd_range_kernel(self._device.queue, kernel, size, local)
         self._device.timings.add(self.label, event)
 
     def _check_arguments(self, values: dict[str, Any]) -> list[Any]:
@@ -483,7 +517,7 @@ class Program:
             ) from error
         try:
             self.kernels = {
-                name: Kernel(device, f"{path.name}:{name}", cl.Kernel(program, name), arguments)
+                name: Kernel(device, f"{path.name}:{name}", partial(cl.Kernel, program, name), arguments)
                 for name, arguments in parse_kernels(source).items()
             }
         except CACHE_ERRORS as error:

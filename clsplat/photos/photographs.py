@@ -176,6 +176,11 @@ def unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: fl
 
     The planes are zero outside the image.
     """
+    key = "unpack", name, factor, pixels.shape, camera.size
+    return workspace.plans.run(key, {"pixels": pixels}, _unpack, workspace, camera, pixels, factor, name)
+
+
+def _unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: float, name: str) -> Array:
     channels = pixels.shape[0]
     planes = workspace.array(name, (channels, camera.rows, camera.stride))
     lanes = int(workspace.device.tuning["LANES"])

@@ -41,6 +41,11 @@ class DeviceCamera:
     values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host
 
     @property
+    def size(self) -> tuple[int, ...]:
+        """The sizes of the image and its planes, as a part of the keys of plans."""
+        return self.width, self.height, self.tiles_x, self.tiles_y
+
+    @property
     def tiles(self) -> int:
         return self.tiles_x * self.tiles_y
 

@@ -103,28 +103,38 @@ def projection_arguments(model: DeviceModel, camera: DeviceCamera) -> dict[str, 
 RECORD = int(constants()["RECORD"])
 
 
-def project(
-    workspace: Workspace, model: DeviceModel, camera: DeviceCamera, band: Band, splats: Array, radius: Array
-) -> Footprints:
-    """Write the records and radii of splats; return their footprints on the tiles of a band.
+@dataclass(frozen=True)
+class ProjectedSplats:
+    """The splats of a model in a band of tiles."""
 
-    splats: [N, RECORD]; radius: [S] px.  The footprints are valid until the next call.
+    splats: Array  # [N, RECORD]
+    radius: Array  # [S] px
+    footprints: Footprints
+
+
+def project(
+    workspace: Workspace, model: DeviceModel, camera: DeviceCamera, band: Band, visibility: Mapping[str, Any]
+) -> ProjectedSplats:
+    """Project the Gaussians of a model; the projection is valid until the next call.
+
+    visibility: see `visibility_arguments`.
     """
     gaussians = model.gaussians
     device, count, stride = gaussians.device, gaussians.count, gaussians.capacity
+    splats, radius = workspace.array("splats", (count, RECORD)), workspace.array("radius", stride)
     footprints = Footprints(*(workspace.array(field.name, stride, np.uint32) for field in fields(Footprints)))
     device.program("project.cl", **model.defines).project_forward(
         items=-(-count // int(device.tuning["LANES"])),
         **projection_arguments(model, camera),
         sh_base=gaussians["sh_base"],
-        **visibility_arguments(model, camera.view, workspace.array("left_out", stride)),
+        **visibility,
         splats=splats,
         **vars(footprints),
         radius=radius,
         row_begin=band.row_begin,
         row_end=band.row_end,
     )
-    return footprints
+    return ProjectedSplats(splats, radius, footprints)
 
 
 def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> None:
@@ -134,10 +144,10 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
     """
     deferred, on_host = model.gaussians.deferred, model.gaussians.on_host
     if on_host or (deferred and deferred.updates):
-        splats = workspace.array("splats", (model.gaussians.count, RECORD))
-        radius = workspace.array("radius", model.gaussians.capacity)
         empty_band = Band(camera.tiles_x, camera.tiles_y, 0, 0)
-        depth_key = project(workspace, replace(model, degree=0), camera, empty_band, splats, radius).depth_key
+        mask = workspace.array("left_out", model.gaussians.capacity)
+        visibility = visibility_arguments(model, camera.view, mask)
+        depth_key = project(workspace, replace(model, degree=0), camera, empty_band, visibility).footprints.depth_key
         if on_host:
             on_host.upload_visible(depth_key)
         if deferred:
@@ -168,6 +178,12 @@ class Frame:
     bands: list[Band]  # `lists` belongs to the last one
     content: Content  # of the planes
     model: DeviceModel  # the rendered model; a moving one at the timestamp of the camera
+
+    @property
+    def key(self) -> tuple[int, ...]:
+        """Numbers that identify the memory of the frame and of its lists, as a part of the keys of plans."""
+        arrays = self.splats, self.radius, self.depth_key, self.tile_last, self.image, self.transmittance
+        return tuple(array.buffer.serial for array in arrays)
 
 
 def pose_gradient(
@@ -266,22 +282,31 @@ class Rasterizer:
         return bands < camera.tiles_y
 
     def _forward(self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content) -> Frame:
-        array = self.workspace.array
-        splats = array("splats", (model.gaussians.count, RECORD))
-        radius = array("radius", model.gaussians.capacity)
-        image = array("image", (4 if content == "inverse_depth" else 3, camera.rows, camera.stride))
-        transmittance = array("transmittance", (camera.rows, camera.stride))
-        tile_last = array("tile_last", camera.tiles, np.uint32)
         bands = self._split(camera)
         for band in bands:
-            lists = self._project_band(model, camera, band, splats, radius, content)
+            projection, lists = self._list_band(model, camera, band, content)
+            planes = self._blend_band(model, camera, band, background, content, projection.splats, lists)
+        splats, radius, depth_key = projection.splats, projection.radius, projection.footprints.depth_key
+        return Frame(camera, splats, depth_key, radius, lists, *planes, bands, content, model)
+
+    def _blend_band(
+        self, model: DeviceModel, camera: DeviceCamera, band: Band, background: Array, content: Content, *splats: Any
+    ) -> tuple[Array, Array, Array]:
+        """Blend a band; return `tile_last`, the image, and the transmittance.  splats: their records and lists."""
+        records, lists = splats
+
+        def blend() -> tuple[Array, Array, Array]:
+            array = self.workspace.array
+            image = array("image", (4 if content == "inverse_depth" else 3, camera.rows, camera.stride))
+            transmittance = array("transmittance", (camera.rows, camera.stride))
+            tile_last = array("tile_last", camera.tiles, np.uint32)
             for first_tile, groups in self._launches(band):
                 self._blend(content, **model.defines).blend_forward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
                     pair_splat=lists.pair_splat,
-                    splats=splats,
+                    splats=records,
                     background=background,
                     camera=camera.array,
                     image=image,
@@ -289,15 +314,20 @@ class Rasterizer:
                     tile_last=tile_last,
                     first_tile=first_tile,
                 )
-        buffers = splats, array("depth_key", model.gaussians.capacity, np.uint32), radius, lists, tile_last
-        return Frame(camera, *buffers, image, transmittance, bands, content, model)
+            return tile_last, image, transmittance
+
+        key = "blend", model.key, camera.size, content, band, self.budget.tiles, lists.key
+        return self.workspace.plans.run(key, {"camera": camera.array, "background": background}, blend)
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """Return the blending kernels for this content."""
         return self.device.program(f"blend_{self.device.schedule}.cl", **defines, **DEFINES.get(content, {}))
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
-        rows = np.linspace(0, camera.tiles_y, min(self._bands.get(camera.tiles_y, 1), camera.tiles_y) + 1).astype(int)
+        bands = min(self._bands.get(camera.tiles_y, 1), camera.tiles_y)
+        if bands == 1:
+            return [Band(camera.tiles_x, camera.tiles_y, 0, camera.tiles_y)]
+        rows = np.linspace(0, camera.tiles_y, bands + 1).astype(int)
         return [Band(camera.tiles_x, camera.tiles_y, int(begin), int(end)) for begin, end in pairwise(rows)]
 
     def _launches(self, band: Band) -> list[tuple[int, int]]:
@@ -306,22 +336,35 @@ class Rasterizer:
         end = band.first_tile + band.tiles_inside
         return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]
 
-    def _project_band(
-        self, model: DeviceModel, camera: DeviceCamera, band: Band, splats: Array, radius: Array, content: Content
-    ) -> TileLists:
-        gaussians = model.gaussians
-        count, stride = gaussians.count, gaussians.capacity
-        footprints = project(self.workspace, model, camera, band, splats, radius)
-        if content == "depth":
-            self.device.program("depth.cl").paint_depth(
-                items=count, means=gaussians["means"], camera=camera.array, splats=splats, stride=stride, count=count
-            )
-        rows = band.row_end - band.row_begin
+    def _list_band(
+        self, model: DeviceModel, camera: DeviceCamera, band: Band, content: Content
+    ) -> tuple[ProjectedSplats, TileLists]:
+        """Project the splats, and list those of each tile."""
+        gaussians, rows = model.gaussians, band.row_end - band.row_begin
+        mask = self.workspace.array("left_out", gaussians.capacity)
+        visibility = visibility_arguments(model, camera.view, mask)
+
+        def launch() -> ProjectedSplats:
+            projection = project(self.workspace, model, camera, band, visibility)
+            if content == "depth":
+                self.device.program("depth.cl").paint_depth(
+                    items=gaussians.count,
+                    means=gaussians["means"],
+                    camera=camera.array,
+                    splats=projection.splats,
+                    stride=gaussians.capacity,
+                    count=gaussians.count,
+                )
+            return projection
+
+        key = "project", model.key, camera.size, band, content
+        projection = self.workspace.plans.run(key, {**visibility, "camera": camera.array}, launch)
+        inputs = projection.splats, projection.footprints, band, gaussians.count
         limit = MAX_PAIRS if rows == 1 else self._limit  # a single row cannot be split further
         while True:
-            lists = self.tiler.build(splats, footprints, band, count, limit, model.defines)
+            lists = self.tiler.build(*inputs, limit, model.defines)
             if rows == camera.tiles_y or self.tiler.has_room(lists):  # the lists of several bands share their memory
-                return lists
+                return projection, lists
 
     def pixel_sums(
         self,
@@ -357,47 +400,74 @@ class Rasterizer:
         texture: Array | None,
         transmittance_gradient: Array | None,
     ) -> Array:
-        defines = {} if count == PIXEL_SUMS else {"PIXEL_SUMS": count}
-        blend_defines = {**defines, "GRAD_BEHIND": 1} if transmittance_gradient else defines
-        pixel_sums = self.workspace.array("pixel_sums", (count, model.gaussians.capacity))
+        lists, pixel_sums = frame.lists, self.workspace.array("pixel_sums", (count, model.gaussians.capacity))
+        changes = {
+            "camera": frame.camera.array,
+            "grad_image": grad_image,
+            "texture": texture or frame.transmittance,  # the kernel reads it only with texture sums
+            "behind": transmittance_gradient or frame.transmittance,
+        }
         for i, band in enumerate(bands):
-            lists = frame.lists
             if len(bands) > 1:
-                lists = self._project_band(frame.model, frame.camera, band, frame.splats, frame.radius, frame.content)
-            pair_sums = self.workspace.array("pair_sums", (lists.pairs, RECORD))
+                _, lists = self._list_band(frame.model, frame.camera, band, frame.content)
+            changes["pair_sums"] = self.workspace.array("pair_sums", (lists.pairs, RECORD))
+            self._sum_band(
+                model, frame, band, lists, pixel_sums, changes, is_first=i == 0, has_behind=bool(transmittance_gradient)
+            )
+        return pixel_sums
+
+    def _sum_band(
+        self,
+        model: DeviceModel,
+        frame: Frame,
+        band: Band,
+        lists: TileLists,
+        pixel_sums: Array,
+        changes: dict[str, Any],
+        **flags: bool,
+    ) -> None:
+        """Add the sums over the pixels of a band to `pixel_sums`, or overwrite it in the first band."""
+
+        def launch() -> None:
+            defines = {} if pixel_sums.shape[0] == PIXEL_SUMS else {"PIXEL_SUMS": pixel_sums.shape[0]}
+            blend_defines = {**defines, **model.defines, **({"GRAD_BEHIND": 1} if flags["has_behind"] else {})}
             for first_tile, groups in self._launches(band):
-                self._blend(frame.content, **blend_defines, **model.defines).blend_backward(
+                self._blend(frame.content, **blend_defines).blend_backward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
                     pair_splat=lists.pair_splat,
                     splats=frame.splats,
-                    camera=frame.camera.array,
                     image=frame.image,
-                    grad_image=grad_image,
-                    texture=texture or frame.transmittance,  # the kernel reads it only with texture sums
-                    behind=transmittance_gradient or frame.transmittance,
                     tile_last=frame.tile_last,
-                    pair_sums=pair_sums,
                     first_tile=first_tile,
+                    **changes,
                 )
-            sum_records(pair_sums, lists, model.gaussians, pixel_sums, defines, accumulate=int(i > 0))
+            pair_sums, accumulate = changes["pair_sums"], int(not flags["is_first"])
+            sum_records(pair_sums, lists, model.gaussians, pixel_sums, defines, accumulate)
             if frame.content == "inverse_depth":
-                sum_inverse_depths(self.workspace, pair_sums, lists, model.gaussians, accumulate=int(i > 0))
-        return pixel_sums
+                sum_inverse_depths(self.workspace, pair_sums, lists, model.gaussians, accumulate)
+
+        size = frame.camera.size, band, pixel_sums.shape[0], self.budget.tiles
+        key = "backward", model.key, frame.key, frame.content, lists.key, size, *flags.values()
+        self.workspace.plans.run(key, changes, launch)
 
     def gradients(self, model: DeviceModel, frame: Frame, pixel_sums: Array) -> GaussianGradients:
         """Return the gradients of the loss with respect to all parameters of the model; valid until the next call."""
         if self._gradients is None or not self._gradients.fits(model.gaussians):
             self._gradients = GaussianGradients(model.gaussians)
         gradients = self._gradients
-        self.device.program("project.cl", **model.defines).project_backward(
-            items=-(-model.gaussians.count // self._lanes),
-            **projection_arguments(frame.model, frame.camera),
-            splats=frame.splats,
-            pixel_sums=pixel_sums,
-            **gradients.arguments(),
-        )
+        arrays = {"splats": frame.splats, "pixel_sums": pixel_sums, **gradients.arguments()}
+
+        def launch() -> None:
+            self.device.program("project.cl", **model.defines).project_backward(
+                items=-(-model.gaussians.count // self._lanes),
+                **projection_arguments(frame.model, frame.camera),
+                **arrays,
+            )
+
+        key = "gradients", frame.model.key, *(array.buffer.serial for array in arrays.values())
+        self.workspace.plans.run(key, {"camera": frame.camera.array}, launch)
         if frame.content == "inverse_depth":
             add_inverse_depth_gradient(self.workspace, frame.camera, frame.splats, gradients["means"])
         backpropagate_motion(model, frame.camera, gradients)

@@ -49,6 +49,12 @@ class TileLists:
     tile_offset: Array  # [T+1]
     tile_pairs: Array  # [room] pairs ordered by tile, front to back
 
+    @property
+    def key(self) -> tuple[int, ...]:
+        """Numbers that identify the memory of the lists, as a part of the keys of plans."""
+        arrays = self.pair_splat, self.first_pair, self.tile_count, self.tile_offset, self.tile_pairs
+        return tuple(array.buffer.serial for array in arrays)
+
     @cached_property
     def pairs(self) -> int:
         """The number of pairs.  Reading it waits until the device has counted them, but not for later work."""
@@ -111,19 +117,40 @@ class Tiler:
         """
         if self.sort == "auto":
             self.sort = self._measure_faster_sort(splats, footprints, band, count, limit, defines)
-        depth_key, tile_count = footprints.depth_key, footprints.tile_count
-        large = self._large_arguments(splats, footprints, band, count)
-        program = self.device.program("large.cl", **(defines or {}))
-        program.count_large(**large)
-        order = self._depth_order(depth_key, count) if self.sort == "radix" else self._index_order(count)
-        ordered_count = self.workspace.array("ordered_count", count, np.uint32)
-        self._scan.permute(items=count, values=tile_count, order=order, permuted=ordered_count, count=count)
-        pair_offset = self.scan(ordered_count, count, "pair_offset")
+        plans, inputs = self.workspace.plans, (splats, footprints, band, count, defines)
+        serials = (array.buffer.serial for array in (splats, *vars(footprints).values(), self._zero))
+        key = self.sort, band, count, *(defines or {}).items(), *serials
+        order, pair_offset = plans.run(("order", key), {}, self._order, *inputs)
         read_pairs = pair_offset.get_item_later(count)
         if not self._room:
             self._make_room(read_pairs(), limit)
         room = min(self._room, limit)
+        lists = plans.run(("lists", key, room), {}, self._list_pairs, room, order, pair_offset, *inputs)
+        return TileLists(read_pairs, room, limit, *lists)
 
+    def _order(
+        self, splats: Array, footprints: Footprints, band: Band, count: int, defines: Defines
+    ) -> tuple[Array, Array]:
+        """Return the order in which pairs are emitted, [N], and the first pair of each position in it, [N+1]."""
+        large = self._large_arguments(splats, footprints, band, count)
+        self.device.program("large.cl", **(defines or {})).count_large(**large)
+        order = self._depth_order(footprints.depth_key, count) if self.sort == "radix" else self._index_order(count)
+        ordered_count = self.workspace.array("ordered_count", count, np.uint32)
+        self._scan.permute(items=count, values=footprints.tile_count, order=order, permuted=ordered_count, count=count)
+        return order, self.scan(ordered_count, count, "pair_offset")
+
+    def _list_pairs(
+        self,
+        room: int,
+        order: Array,
+        pair_offset: Array,
+        splats: Array,
+        footprints: Footprints,
+        band: Band,
+        count: int,
+        defines: Defines,
+    ) -> tuple[Array, ...]:
+        """List up to `room` pairs; return the arrays of TileLists."""
         pair_tile, pair_splat = self._pair_array("pair_tile", room), self._pair_array("pair_splat", room)
         first_pair = self.workspace.array("first_pair", count, np.uint32)
         pair_count = self.workspace.array("pair_count", 1, np.uint32)
@@ -141,16 +168,20 @@ class Tiler:
             room=room,
             count=count,
         )
-        lists: dict[str, Any] = {"first_pair": first_pair, "pair_splat": pair_splat}
-        program.emit_large(**large, **lists, pair_count=pair_count, pair_tile=pair_tile)
+        self.device.program("large.cl", **(defines or {})).emit_large(
+            **self._large_arguments(splats, footprints, band, count),
+            first_pair=first_pair,
+            pair_count=pair_count,
+            pair_tile=pair_tile,
+            pair_splat=pair_splat,
+        )
         if self.sort == "radix":
             tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pair_count, room, band.tiles)
         else:
             tile_offset, tile_pairs = self._sort_in_tiles(
-                pair_tile, pair_splat, depth_key, pair_count, room, band.tiles
+                pair_tile, pair_splat, footprints.depth_key, pair_count, room, band.tiles
             )
-        lists |= {"tile_count": tile_count, "tile_offset": tile_offset, "tile_pairs": tile_pairs}
-        return TileLists(read_pairs, room, limit, **lists)
+        return pair_splat, first_pair, footprints.tile_count, tile_offset, tile_pairs
 
     def has_room(self, lists: TileLists) -> bool:
         """Wait for the number of pairs, and return whether they fit; if not, make room, so that `build` succeeds.

@@ -8,15 +8,17 @@ from numpy.typing import DTypeLike
 
 from clsplat.core.errors import MemoryLimitError
 from clsplat.opencl.device import Array, Device
+from clsplat.opencl.plan import Plans
 
 GROWTH = 1.25  # factor on the requested length when an array grows
 
 
 class Workspace:
-    """Named arrays, each of which keeps its buffer until it must grow."""
+    """Named arrays, each of which keeps its buffer until it must grow, and plans of launches that use them."""
 
     def __init__(self, device: Device) -> None:
         self.device = device
+        self.plans = Plans(device)
         self._arrays: dict[str, Array] = {}
 
     def array(
@@ -32,6 +34,7 @@ class Workspace:
         array = self._arrays.get(name)
         if array is None or array.nbytes < length * value_type.itemsize:
             is_growing, array = array is not None, None
+            self.plans.clear()  # their results contain the old array
             self._arrays.pop(name, None)  # frees the old buffer before the new one is allocated
             array = self._arrays[name] = (
                 self._allocate_with_slack(length, value_type, slack)

@@ -15,6 +15,7 @@ from clsplat.gaussians.gaussians import DeviceModel, Gaussians
 from clsplat.gaussians.sh_offload import slot_arguments, slot_defines
 from clsplat.gaussians.structs import DeferredUpdates, GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
+from clsplat.opencl.plan import Plans
 from clsplat.render.rasterizer import Frame, projection_arguments
 from clsplat.training.motion import MotionRates, update_motion
 
@@ -94,6 +95,7 @@ class Rates(Settings):
 
 Rows = Literal["all", "seen", "deferred"]  # rows to update; deferred: all rows, some of them later
 _EVERY = {"all": 0xFFFFFFFF, "seen": 0, "deferred": 0xFFFFFFFF}
+_FACTORS = {name: (f"{name}_rate", f"{name}_correction2") for name in PARAMETERS}  # kernel arguments
 _UNDRAWN = {"all": 0xFFFFFFFF, "seen": 0xFFFFFFFF, "deferred": 0}
 
 
@@ -110,6 +112,7 @@ class Adam:
 
     def __init__(self, gaussians: Gaussians) -> None:
         self.gaussians = gaussians
+        self._plans = Plans(gaussians.device)
         self.updates = dict.fromkeys(gaussians.trained, 0)
         gaussians.device.program("adam.cl")  # built before the first step
         self._lanes = int(gaussians.device.tuning["LANES"])
@@ -127,29 +130,32 @@ class Adam:
 
         Returns the gradient of the projected means, [2, S] px⁻¹, which is valid until the next update.
         """
-        gaussians = self.gaussians
-        rows = self._effective_rows(rows)
-        grad_mean2d = self._mean2d()
-        arguments: dict[str, Any] = {"sh_base": gaussians["sh_base"]}
+        gaussians, rows, grad_mean2d = self.gaussians, self._effective_rows(rows), self._mean2d()
         deferred = self._prepare_deferred(rows, model, rates)
-        for name in PARAMETERS:
-            moment1, moment2 = (gaussians.tables[table].array for table in moment_tables(name))
-            rate, correction2 = self._count_update(name, rates)
-            arguments |= {f"{name}_moment1": moment1, f"{name}_moment2": moment2}
-            arguments |= {f"{name}_rate": rate, f"{name}_correction2": correction2}
-        program = gaussians.device.program("adam.cl", **model.defines)
-        program.update_gaussians(
-            items=-(-gaussians.count // (self._lanes * self._vectors)),
-            **projection_arguments(model, frame.camera),
-            **arguments,
-            sh_rest_degree=model.degree if rates["sh_rest"] else 0,
-            every=_EVERY[rows],
-            undrawn=_UNDRAWN[rows],
-            splats=frame.splats,
-            pixel_sums=pixel_sums,
-            grad_mean2d=grad_mean2d,
-        )
-        self._record_sh(deferred, frame, arguments["sh_rest_rate"], arguments["sh_rest_correction2"])
+        changes: dict[str, Any] = {"camera": frame.camera.array}
+        for name, (rate_name, correction_name) in _FACTORS.items():
+            changes[rate_name], changes[correction_name] = self._count_update(name, rates)
+        changes["sh_rest_degree"] = model.degree if rates["sh_rest"] else 0
+        arrays: dict[str, Any] = {"splats": frame.splats, "pixel_sums": pixel_sums, "grad_mean2d": grad_mean2d}
+
+        def launch() -> None:
+            tables: dict[str, Any] = {
+                f"{name}_moment{number}": gaussians.tables[table].array
+                for name in PARAMETERS
+                for number, table in enumerate(moment_tables(name), 1)
+            }
+            gaussians.device.program("adam.cl", **model.defines).update_gaussians(
+                items=-(-gaussians.count // (self._lanes * self._vectors)),
+                **{**projection_arguments(model, frame.camera), **arrays, **changes},
+                **tables,
+                sh_base=gaussians["sh_base"],
+                every=_EVERY[rows],
+                undrawn=_UNDRAWN[rows],
+            )
+
+        key = "update", model.key, rows, *(array.buffer.serial for array in arrays.values())
+        self._plans.run(key, changes, launch)
+        self._record_sh(deferred, frame, changes["sh_rest_rate"], changes["sh_rest_correction2"])
         return grad_mean2d
 
     def step(
@@ -170,32 +176,37 @@ class Adam:
         for name in PARAMETERS:
             if name in frozen or (name == "sh_rest" and not rates[name]):
                 continue
-            components = gaussians.tables[name].components
-            if name == "sh_rest":
-                components = 3 * (sh_coefficients(model.degree) - 1)
-            values, moment1, moment2 = (gaussians.tables[table].array for table in (name, *moment_tables(name)))
             rate, correction2 = self._count_update(name, rates)
-            defines = slot_defines(gaussians) if name == "sh_rest" else {}
-            gaussians.device.program("adam.cl", **defines).adam_step(
-                items=(-(-gaussians.count // self._lanes), components),
-                values=values,
-                gradient=gradients[name],
-                moment1=moment1,
-                moment2=moment2,
-                depth_key=frame.depth_key,
-                rate=rate,
-                correction2=correction2,
-                every=_EVERY[rows],
-                undrawn=_UNDRAWN[rows] if name == "sh_rest" else _UNDRAWN["all"],
-                **slot_arguments(gaussians),
-                stride=gaussians.capacity,
-                count=gaussians.count,
-            )
+            inputs = {"gradient": gradients[name], "depth_key": frame.depth_key}
+            self._step_table(name, model.degree, rows, inputs, {"rate": rate, "correction2": correction2})
             if name == "sh_rest":
                 self._record_sh(deferred, frame, rate, correction2)
         if gaussians.is_moving and MOTION not in frozen:
             self.updates[MOTION] += 1
             update_motion(gaussians, gradients, frame.depth_key, rates, self.updates[MOTION], _EVERY[rows])
+
+    def _step_table(self, name: str, degree: int, rows: Rows, inputs: dict[str, Any], factors: dict[str, Any]) -> None:
+        gaussians, is_sh_rest = self.gaussians, name == "sh_rest"
+
+        def launch() -> None:
+            values, moment1, moment2 = (gaussians.tables[table].array for table in (name, *moment_tables(name)))
+            components = 3 * (sh_coefficients(degree) - 1) if is_sh_rest else gaussians.tables[name].components
+            gaussians.device.program("adam.cl", **(slot_defines(gaussians) if is_sh_rest else {})).adam_step(
+                items=(-(-gaussians.count // self._lanes), components),
+                values=values,
+                moment1=moment1,
+                moment2=moment2,
+                **inputs,
+                **factors,
+                every=_EVERY[rows],
+                undrawn=_UNDRAWN[rows] if is_sh_rest else _UNDRAWN["all"],
+                **slot_arguments(gaussians),
+                stride=gaussians.capacity,
+                count=gaussians.count,
+            )
+
+        key = "step", name, degree, gaussians.key, rows, *(array.buffer.serial for array in inputs.values())
+        self._plans.run(key, factors, launch)
 
     def _prepare_deferred(self, rows: Rows, model: DeviceModel, rates: dict[str, float]) -> DeferredUpdates | None:
         """Return the deferred updates of `sh_rest`, or None if none of its updates are deferred."""

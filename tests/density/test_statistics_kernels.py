@@ -217,7 +217,9 @@ def test_texture_counts_views_by_their_weight(device, rng):
     for weights, textures in (((3.0, 2.0, 0.0), (0.2, 0.1, 0.0)), ((0.0, 6.0, 0.0), (0.0, 0.5, 0.0))):
         pixel_sums, radius = np.zeros((WEIGHT + 2, capacity)), np.zeros(capacity)
         pixel_sums[WEIGHT, :3], pixel_sums[WEIGHT + 1, :3], radius[:3] = weights, np.multiply(weights, textures), 5
-        view = ViewGradients(SimpleNamespace(radius=device.upload(radius.astype(np.float32))), None, [],
-                              device.upload(pixel_sums.astype(np.float32)))  # fmt: skip
+        frame = SimpleNamespace(
+            radius=device.upload(radius.astype(np.float32)), camera=SimpleNamespace(width=1, height=1)
+        )
+        view = ViewGradients(frame, None, [], device.upload(pixel_sums.astype(np.float32)))
         stats.add(view, device.zeros((2, capacity)))
     np.testing.assert_allclose(stats.mean("texture"), [0.2, 0.4, 0.0], rtol=1e-6)
