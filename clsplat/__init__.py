@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from clsplat.api.commands import train_in_blocks as train_in_blocks
     from clsplat.api.commands import view as view
     from clsplat.api.commands import write_levels as write_levels
+    from clsplat.api.commands import write_mesh as write_mesh
     from clsplat.api.renderer import FieldRenderer as FieldRenderer
     from clsplat.api.renderer import Gradients as Gradients
     from clsplat.api.renderer import Renderer as Renderer
@@ -92,7 +93,7 @@ sys.meta_path.append(_CheckoutFinder)
 _EXPORTS = {  # modules that define the names; `import clsplat` does not import them
     "clsplat.api.commands": "align cancel check compare_runs compress_model convert copy_pipeline describe_run evaluate"
     " pipeline_schema pipelines plan_in_blocks resume run run_cell status status_schema"
-    " run_worker train_in_blocks view write_levels",
+    " run_worker train_in_blocks view write_levels write_mesh",
     "clsplat.api.rendering": "camera_path render_path render_views write_cameras write_video",
     "clsplat.api.renderer": "FieldRenderer Gradients RenderResult Renderer",
     "clsplat.api.tools": "devices doctor inspect_scene load_plugin measure_speed read_measurement",

@@ -299,6 +299,35 @@ def write_levels(
     return build_levels(Path(model), Path(folder), to_path(scene), plan, device)
 
 
+def write_mesh(
+    model: PathLike,
+    file: PathLike,
+    scene: PathLike | None = None,
+    *,
+    voxel: float | None = None,
+    keep: float = 1.0,
+    collision: bool = False,
+    downscale: float | None = None,
+    device: "str | Device | None" = None,
+) -> dict[str, Any]:
+    """Write the surface of a model as a mesh with colors and normals, in world coordinates.
+
+    model, scene, downscale: as for `render_views`; the depths of the training views are fused
+    file: a .ply, .obj, or .glb file
+    voxel: the resolution, in scene units; default: 1.2 pixels at the median depth
+    keep: reduce the mesh to this fraction of its faces; this requires the extra `mesh`
+    collision: write the closed hull of everything that no two views see as free, with twice this voxel by default
+
+    Returns `file`, `bytes`, the numbers of `vertices` and `faces`, the `voxel`, and whether the surface is `closed`.
+    Raises DataError for a moving model, a field, or a model without an opaque surface.
+    """
+    from clsplat.workflows import mesh
+
+    load_plugins()
+    options = mesh.MeshOptions(voxel, keep, collision)
+    return mesh.write_mesh(Path(model), Path(file), to_path(scene), options, downscale, device)
+
+
 # Training a large scene in blocks.
 
 

@@ -33,6 +33,7 @@ SYNONYMS = {
     **dict.fromkeys(("shrink", "prune", "quantize"), "compress"),
     **dict.fromkeys(("decimate", "simplify", "levels", "stream"), "lod"),
     **dict.fromkeys(("split", "tiles", "city"), "blocks"),
+    **dict.fromkeys(("surface", "collider"), "mesh"),
     "diff": "compare",
     "help": "--help",
     "version": "--version",
@@ -43,7 +44,7 @@ MIN_ADDRESS_SPACE = 1 << 30  # bytes; OpenCL runtimes need more
 ORDER = [
     *("run", "blocks", "resume", "status", "cell", "cancel", "worker"),
     *("check", "pipelines", "devices", "doctor", "inspect"),
-    *("render", "view", "evaluate", "align", "convert", "compress", "lod", "compare", "bench", "data"),
+    *("render", "view", "evaluate", "align", "convert", "compress", "lod", "mesh", "compare", "bench", "data"),
 ]
 
 

@@ -310,6 +310,44 @@ def lod(
     terminal.print_message(f"{result['folder']}/lod-meta.json: {result['bytes'] / 1e6:.3g} MB{note}")
 
 
+ScaleOption = Annotated[
+    float | None,
+    typer.Option(
+        min=1, metavar="N", help="Divisor of the image size; default: the divisor of the run, or 1 for a model file."
+    ),
+]
+
+
+@command(
+    "mesh",
+    "clsplat mesh runs/splat_7k scene.glb",
+    "clsplat mesh point_cloud.ply a.ply --scene my_scene --voxel 0.02",
+    "clsplat mesh runs/splat_7k hull.obj --collision --keep 0.1",
+)
+def mesh(
+    model: ModelArgument,
+    file: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .ply, .obj, or .glb.")],
+    scene: SceneOption = None,
+    voxel: Annotated[
+        float | None,
+        typer.Option(metavar="SIZE", help="Resolution in scene units; default: 1.2 pixels at the median depth."),
+    ] = None,
+    keep: Annotated[float, typer.Option(metavar="F", help="Fraction of the faces to keep.")] = 1.0,
+    collision: Annotated[
+        bool, typer.Option("--collision", help="Write a closed hull of what no two views see as free space.")
+    ] = False,
+    scale: ScaleOption = None,
+    device: DeviceOption = None,
+) -> None:
+    """Write the surface of a model as a triangle mesh with colors, from the depths of the training views."""
+    result = commands.write_mesh(
+        model, file, scene, voxel=voxel, keep=keep, collision=collision, downscale=scale, device=device
+    )
+    size = f"{result['faces']:,} faces, {result['vertices']:,} vertices, {result['bytes'] / 1e6:.3g} MB"
+    kind = "closed" if result["closed"] else "open"
+    terminal.print_message(f"{result['file']}: {size}; {kind}, voxel {result['voxel']:.3g} scene units")
+
+
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
 def compare(
     runs: Annotated[
@@ -327,12 +365,6 @@ def compare(
 
 # Rendering of views, and of videos along a camera path.
 
-ScaleOption = Annotated[
-    float | None,
-    typer.Option(
-        min=1, metavar="N", help="Divisor of the image size; default: the divisor of the run, or 1 for a model file."
-    ),
-]
 PathOption = Annotated[
     str | None,
     typer.Option(metavar="PATH", help="Video: ellipse, spiral, orbit, through, views, fixed[:VIEW], or a path file."),

@@ -12,6 +12,7 @@ import json
 import logging
 import re
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -321,7 +322,9 @@ def _index(value: Any) -> int:
 MAGIC = b"glTF"
 JSON, BINARY = 0x4E4F534A, 0x004E4942  # types of chunks
 POINTS = 0  # mode of a primitive
-FLOAT, BYTE = 5126, 5121  # component types
+FLOAT, BYTE, SHORT = 5126, 5121, 5123  # component types
+KINDS = {np.dtype(c): kind for c, kind in (("<f4", FLOAT), ("u1", BYTE), ("<u2", SHORT), ("<u4", 5125))}
+INDICES = "indices"  # key of a primitive
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 MAX_JSON = 1 << 26  # bytes
 
@@ -369,49 +372,64 @@ def read_gltf(path: Path) -> SplatFile:
 def write_glb(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     """Write Gaussians as one primitive; return the SHA-256 of the file.  Raises OutputError."""
     require_gaussians(path, splats)
-    p = flip_axes(splats.parameters)
-    attributes = _make_attributes(p)
+    primitive = {"mode": POINTS, "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": SRGB}}}
+    tree: dict[str, Any] = {"extensionsUsed": [EXTENSION]}
+    if splats.rendering:
+        tree["asset"] = {"extras": {"clsplat": splats.rendering}}
+    attributes = _make_attributes(flip_axes(splats.parameters))
+    return write_primitive(path, attributes, primitive, tree, splats.rendering.get("origin"))
+
+
+def write_primitive(
+    path: Path,
+    attributes: dict[str, NDArray[Any]],
+    primitive: dict[str, Any],
+    tree: dict[str, Any],
+    origin: Sequence[float] | None = None,
+    indices: NDArray[np.uint32] | None = None,
+) -> str:
+    """Write a .glb file with one primitive; return its SHA-256.  Raises OutputError.
+
+    attributes: tables [N, components] in the axes of glTF; integers are normalized.  primitive, tree: other entries of
+    the primitive and of the file.  origin: world coordinates of zero, [3], in the axes of a PLY.  indices: of triangles
+    """
+    tables = attributes if indices is None else {**attributes, INDICES: indices.reshape(-1, 1)}
     views: list[Any] = []
     accessors: list[Any] = []
-    blocks, start = [], 0
-    for name, table in attributes.items():
-        kind = BYTE if table.dtype == np.uint8 else FLOAT
+    for name, table in tables.items():
+        kind = KINDS[table.dtype]
         accessor = {"bufferView": len(views), "componentType": kind, "count": len(table), "type": TYPES[table.shape[1]]}
-        if kind == BYTE:
+        if kind in (BYTE, SHORT):
             accessor["normalized"] = True
         if name == "POSITION":
             accessor |= {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}
+        start = sum(view["byteLength"] for view in views)
         views.append({"buffer": 0, "byteOffset": start, "byteLength": table.nbytes})
         accessors.append(accessor)
-        blocks.append(table.tobytes())
-        start += table.nbytes
-    primitive = {
-        "mode": POINTS,
-        "attributes": {name: i for i, name in enumerate(attributes)},
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": SRGB}},
-    }
-    asset: dict[str, Any] = {"version": "2.0", "generator": "clsplat"}
-    origin = _origin(splats)
-    if splats.rendering:
-        asset["extras"] = {"clsplat": splats.rendering}
+    end = sum(view["byteLength"] for view in views)
+    names = {name: i for i, name in enumerate(tables)}
+    primitive = {**primitive, "attributes": {name: names[name] for name in attributes}}
+    if indices is not None:
+        primitive[INDICES] = names[INDICES]
+    translation = {"translation": (np.array(FLIP) * origin).tolist()} if origin else {}
     tree = {
-        "asset": asset,
-        "extensionsUsed": [EXTENSION],
+        **tree,
+        "asset": {"version": "2.0", "generator": "clsplat", **tree.get("asset", {})},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, **({"translation": origin} if origin else {})}],
+        "nodes": [{"mesh": 0, **translation}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": start}],
+        "buffers": [{"byteLength": end}],
     }
     text = json.dumps(tree, separators=(",", ":"), sort_keys=True, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     with open_hashed(path) as file:
-        file.write(struct.pack("<4s2I", MAGIC, 2, 12 + 8 + len(text) + 8 + start))
-        file.write(struct.pack("<2I", len(text), JSON) + text + struct.pack("<2I", start, BINARY))
-        for block in blocks:
-            file.write(block)
+        file.write(struct.pack("<4s2I", MAGIC, 2, 12 + 8 + len(text) + 8 + end))
+        file.write(struct.pack("<2I", len(text), JSON) + text + struct.pack("<2I", end, BINARY))
+        for table in tables.values():
+            file.write(table.tobytes())
     return file.sha256
 
 

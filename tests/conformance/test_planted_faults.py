@@ -60,6 +60,8 @@ FAULTS = {  # kernel -> file, text, wrong text
     "cap_opacity": ("density.cl", "limit / sqrt(energy2)", "limit / energy2"),
     "draw_left_out": ("dropout.cl", "(uint4)(i, step, 2, 0)", "(uint4)(i, step, 1, 0)"),
     "paint_depth": ("depth.cl", "row[2] * means[2 * stride + i]", "row[2] * means[stride + i]"),
+    "integrate_view": ("fusion.cl", "a + right * (b - a)", "a + right * (d - a)"),
+    "count_free": ("fusion.cl", "- z >= voxel", "- z >= 0.0f"),
     "fill_words": ("fill.cl", "(uint16)(word)", "(uint16)(word & 0xfffffffeu | 2u)"),
     "sampling_interval": ("filter.cl", "z * (1.0f / focal[view])", "z * (1.0f / focal[0])"),
     "filter_variance": ("filter.cl", "variance * sampled * sampled", "variance * sampled"),

@@ -1,4 +1,4 @@
-"""Check kernels on planes of pixels: losses, masks, blur, texture, and transients."""
+"""Check kernels on pixels: losses, masks, blur, texture, transients, and the fusion of depth images."""
 
 from typing import Any
 
@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Results, compare_max, match
+from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Results, compare_max, count_true, match
+from clsplat.conformance.scenes import Case, random_case
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, view_error
 from clsplat.methods.opti3dgs import apply_filter, filter_gradients
@@ -15,6 +16,7 @@ from clsplat.opencl.device import Array, Device
 from clsplat.photos.photographs import apply_mask, change_background, unmasked_gradient, unpack
 from clsplat.photos.transforms import Blur, Planes
 from clsplat.render.camera import DeviceCamera
+from clsplat.render.fusion import SIDE, DepthImage, count_free, integrate
 from clsplat.render.workspace import Workspace
 from clsplat.training.modules.transients import mask_transients, measure_residuals
 
@@ -243,3 +245,41 @@ def transients(device: Device, rng: np.random.Generator) -> Results:
         for scale in SCALES:
             yield from check_transient(device, rng, width, height, scale, None)
             yield from check_transient(device, rng, width, height, scale, 0.7)
+
+
+# fusion.cl: depth images of views, at the grid points of blocks.
+
+FUSION_MARGIN = 1e-3  # to a decision, px or truncations
+
+
+def depth_image(rng: np.random.Generator, width: int, height: int) -> DepthImage:
+    """Return a view of two surfaces, with pixels of unknown depth."""
+    depth = np.where(rng.random((height, width)) < 0.3, 2.5, 4) + np.linspace(0, 1, width) ** 2
+    depth += 0.3 * (rng.random((height, width)) < 0.1) + np.linspace(0, 0.5, height)[:, None]
+    depth = ndimage.median_filter(depth, 3) * (rng.random((height, width)) < 0.95)
+    color = rng.random((height, width, 3)).astype(np.float32)
+    return DepthImage(random_case(rng, 1, width, height).view, depth.astype(np.float32), color)
+
+
+@CHECKS.add("integrate_view", "count_free")
+def fusion(device: Device, rng: np.random.Generator) -> Results:
+    voxel, truncation = 0.0625, 0.5
+    for width, height in ((1, 1), (17, 33), (40, 30)):
+        image, label = depth_image(rng, width, height), f"{width} x {height} px"
+        pose = image.view.world_to_camera.astype(np.float64)
+        center = pose[:, :3].T @ (np.array([0, 0, 4]) - pose[:, 3])
+        offsets = np.array([[0, 0, 0], [1, 0, 0], [0, 0, -1]])
+        blocks = (np.floor(center / (voxel * SIDE)) + offsets).astype(np.int32)
+        grid = np.indices((SIDE,) * 3).reshape(3, -1).T
+        points = voxel * (blocks[:, None] * SIDE + grid).reshape(-1, 3).astype(np.float64)
+        pixels = np.concatenate([image.color, image.depth[:, :, None]], axis=2).astype(np.float64)
+        camera = Case({}, image.view).camera()
+        sums, margin = ref.integrate_view(points, pixels, camera, truncation)
+        is_safe = margin > FUSION_MARGIN
+        yield count_true("integrate_view", f"points near a step, {label}", ~is_safe, limit=0.02 * len(points))
+        actual = integrate(device, [image, image], blocks, voxel, truncation)[0].get()
+        yield compare_max("integrate_view", f"sums, {label}", actual[:, is_safe], 2 * sums[:, is_safe], 1e-4, floor=1.0)
+        free = ref.sees_free(points, pixels[:, :, 3], camera, voxel)
+        views = count_free(device, [image, image], blocks, voxel).ravel()
+        wrong = is_safe & (views != 2 * free)
+        yield count_true("count_free", f"views, {label}", wrong, limit=1e-3 * len(points))

@@ -1,4 +1,4 @@
-"""Compute image losses and metrics, and their gradients with respect to x.
+"""Compute image losses and metrics, their gradients with respect to x, and the fusion of depth images.
 
 Images are [C, H, W]: x is the render, y the photograph.
 """
@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from clsplat.conformance.reference.kinds import PinholeCamera
 
 SSIM_RADIUS = 5
 SSIM_SIGMA = 1.5
@@ -213,3 +215,50 @@ def mask_transients(
         box = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
         mask[y, x] = 2 * is_below[box].sum() >= unmasked[box].sum()
     return mask
+
+
+# Fusion of depth images at points: signed distances to the surface, and views of free space.
+
+
+def project_points(points: NDArray[Any], camera: PinholeCamera) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return the image positions, [P, 2] px, the depths, [P], and a mask of the points that the camera shows, [P]."""
+    x, y, z = camera.rotation @ points.T + camera.translation[:, None]
+    safe = np.where(z > 0, z, 1)
+    u, v = camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy
+    return np.stack([u, v], axis=1), z, (z > 0) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+
+
+def integrate_view(
+    points: NDArray[Any], pixels: NDArray[Any], camera: PinholeCamera, truncation: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return what a view adds to each point, [6, P], and the smallest margin to a decision in px or truncations, [P].
+
+    pixels: [H, W, 4] colors and depth.  The rows: distance, 1; near the surface also red, green, blue, 1.
+    """
+    position, z, is_shown = project_points(points, camera)
+    sums, margin = np.zeros((6, len(points))), np.abs(2 * position - np.rint(2 * position)).min(axis=1) / 2
+    for i in np.flatnonzero(is_shown):
+        u, v = position[i]
+        color, depth = pixels[int(v), int(u), :3], pixels[int(v), int(u), 3]
+        column, row = math.floor(u - 0.5), math.floor(v - 0.5)
+        around = pixels[row : row + 2, column : column + 2, 3] if min(row, column) >= 0 else np.zeros((0, 0))
+        if around.shape == (2, 2) and around.min() > 0:
+            step = (around.max() - around.min()) / truncation
+            margin[i] = min(margin[i], abs(step - 1))
+            right, down = u - 0.5 - column, v - 0.5 - row
+            between = np.array([1 - down, down]) @ around @ np.array([1 - right, right])
+            depth = between if step < 1 else depth
+        distance = (depth - z[i]) / truncation
+        margin[i] = min(margin[i], abs(distance - 1), abs(distance + 1))
+        if depth > 0 and distance >= -1:
+            sums[:2, i] = min(distance, 1), 1
+            if distance < 1:
+                sums[2:, i] = *color, 1
+    return sums, margin
+
+
+def sees_free(points: NDArray[Any], depths: NDArray[Any], camera: PinholeCamera, voxel: float) -> NDArray[np.bool_]:
+    """Return a mask of the points that are in front of the surface of a view, [P], by at least a voxel."""
+    position, z, is_shown = project_points(points, camera)
+    column, row = np.where(is_shown[:, None], position, 0).astype(int).T
+    return np.asarray(is_shown & (depths[row, column] - z >= voxel))

@@ -1,0 +1,106 @@
+"""Represent triangle meshes, and write them as PLY, OBJ, or GLB."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clsplat.core.files import open_atomic
+from clsplat.formats.gltf_usd import write_primitive
+from clsplat.formats.packing import open_hashed
+from clsplat.formats.ply import format_ply_header
+from clsplat.formats.splats import FLIP
+
+Floats = NDArray[np.float64]
+TRIANGLES = 4  # mode of a primitive in glTF
+UNLIT = "KHR_materials_unlit"  # the colors include the light of the photos
+ROWS = 4096  # of text, formatted at once
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles, counterclockwise from outside."""
+
+    vertices: Floats  # [V, 3] scene units
+    faces: NDArray[np.int64]  # [F, 3]
+    colors: NDArray[np.uint8]  # [V, 3] sRGB
+
+    def normals(self) -> Floats:
+        """Return the unit normals of the vertices, [V, 3], averages over their faces by area."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        by_area, corners, count = np.cross(b - a, c - a), self.faces.ravel(), len(self.vertices)
+        total = np.stack([np.bincount(corners, np.repeat(by_area[:, k], 3), count) for k in range(3)], axis=1)
+        length = np.linalg.norm(total, axis=1, keepdims=True)
+        return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
+
+    def edge_counts(self) -> NDArray[np.int64]:
+        """Return the number of faces at each edge, [E]: 2 inside a surface, 1 on its border, more if not manifold."""
+        edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        return np.asarray(np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1])
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether every edge has two faces."""
+        return bool((self.edge_counts() == 2).all())
+
+    def select(self, is_kept: NDArray[np.bool_]) -> "Mesh":
+        """Return the mesh with only these faces, [F], and the vertices that they use."""
+        used, faces = np.unique(self.faces[is_kept], return_inverse=True)
+        return Mesh(self.vertices[used], faces.reshape(-1, 3), self.colors[used])
+
+
+def write_ply(path: Path, mesh: Mesh, origin: Floats) -> None:
+    """Write a binary PLY file; coordinates are double if the scene has an origin.  Raises OutputError."""
+    kind, code = ("double", "<f8") if origin.any() else ("float", "<f4")
+    names = [*((f"{kind} {name}", code) for name in "xyz"), *((f"float n{name}", "<f4") for name in "xyz")]
+    names += [(f"uchar {name}", "u1") for name in ("red", "green", "blue")]
+    vertices = np.empty(len(mesh.vertices), [(name.split()[1], code) for name, code in names])
+    columns = (*(mesh.vertices + origin).T, *mesh.normals().T, *mesh.colors.T)
+    for name, column in zip(vertices.dtype.names or (), columns, strict=True):
+        vertices[name] = column
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    elements = {
+        "vertex": (len(vertices), [name for name, _ in names]),
+        "face": (len(faces), ["list uchar int vertex_indices"]),
+    }
+    with open_atomic(path) as file:
+        file.write(format_ply_header(["clsplat"], **elements) + vertices.tobytes() + faces.tobytes())
+
+
+def write_obj(path: Path, mesh: Mesh, origin: Floats) -> None:
+    """Write an OBJ file with vertex colors.  Raises OutputError."""
+    vertices = np.concatenate([mesh.vertices + origin, mesh.colors / 255], axis=1)
+    corners, number = np.repeat(mesh.faces + 1, 2, axis=1), "%.6f" if origin.any() else "%.9g"
+    with open_hashed(path) as file:
+        for row, table in (
+            (f"v {number} {number} {number} %.4g %.4g %.4g\n", vertices),
+            ("vn %.4g %.4g %.4g\n", mesh.normals()),
+            ("f %d//%d %d//%d %d//%d\n", corners),
+        ):
+            for start in range(0, len(table), ROWS):
+                block = table[start : start + ROWS]
+                file.write((row * len(block) % tuple(block.ravel().tolist())).encode())
+
+
+def write_glb(path: Path, mesh: Mesh, origin: Floats) -> None:
+    """Write a GLB file: y up, vertex colors in 16 bits, the origin as the translation of its node.
+
+    Raises OutputError.
+    """
+    color = mesh.colors / 255
+    linear = np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)  # sRGB, IEC 61966-2-1
+    attributes = {
+        "POSITION": (mesh.vertices * FLIP).astype("<f4"),
+        "NORMAL": (mesh.normals() * FLIP).astype("<f4"),
+        "COLOR_0": np.rint(65535 * np.column_stack([linear, np.ones(len(linear))])).astype("<u2"),
+    }
+    material = {"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}
+    tree = {"materials": [{**material, "extensions": {UNLIT: {}}}], "extensionsUsed": [UNLIT]}
+    primitive, place = {"mode": TRIANGLES, "material": 0}, origin.tolist() if origin.any() else None
+    write_primitive(path, attributes, primitive, tree, place, mesh.faces.astype("<u4"))
+
+
+WRITERS: dict[str, Callable[[Path, Mesh, Floats], None]] = {".ply": write_ply, ".obj": write_obj, ".glb": write_glb}
