@@ -129,7 +129,7 @@ def lpips_network(weights: Weights, net: Net) -> bytes:
 
 
 class Graph:
-    """An ONNX model with operators of version 13, which is encoded as protobuf."""
+    """An ONNX model with opset 13, encoded as protobuf."""
 
     def __init__(self) -> None:
         self._nodes: list[bytes] = []

@@ -16,7 +16,7 @@ class Manifest:
 
     A file is written atomically after its line is on disk, and an outdated file is removed before its new line is
     written.  So every file that exists is complete and was made from the sources in its last line.  Temporary files of
-    killed calls are removed.
+    killed processes are removed.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -182,7 +182,7 @@ class Edit:
         )
 
     def set_rows(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Write values, [n, components], into distinct rows, [n], of a table; fresh rows become copies of them."""
+        """Write values, [n, components], into distinct rows, [n], of a table; the edit copies them to fresh rows."""
         self.gaussians.set_rows(name, rows, values)
 
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:

@@ -200,7 +200,7 @@ class Gltf:
         return np.maximum(rows / np.float32(np.iinfo(dtype).max), -1).astype(np.float32)
 
     def _buffer_view(self, index: Any, stride: int = 0) -> tuple[bytes, int, int, int]:
-        """Return a buffer, and the offset, length, and stride in bytes of a view in it.  stride: the default stride."""
+        """Return the buffer of a view, and the view's offset, length, and stride in bytes.  stride: its default."""
         view = self.tree["bufferViews"][_index(index)]
         if compressions := [name for name in view.get("extensions", {}) if "compression" in name]:
             raise DataError(f"{self.path}: is compressed with {quote(compressions[0])}; export it without compression")

@@ -227,7 +227,7 @@ _COLUMNS = {
 def read_ply(path: Path) -> SplatFile:
     """Read a splat PLY.  The discs of 2DGS, which have no scale_2, get a third log scale of at most FLAT_LOG_SCALE.
 
-    Raises DataError if it is missing, damaged, or not a splat.
+    Raises DataError if it is missing, damaged, or not a splat PLY.
     """
     with open_file(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))

@@ -178,8 +178,8 @@ def _read_splats(path: Path, name: str, runs: list[RowRange]) -> SplatFile:
     for offset, count in runs:
         if offset < end or offset + count > len(splats):
             raise DataError(
-                f"{path}: a leaf has {count} splats at {offset} of {quote(name)}, which has {len(splats)}; its "
-                f"first {end} belong to other leaves; export it again"
+                f"{path}: a leaf contains splats {offset} to {offset + count - 1} of {quote(name)}; expected splats "
+                f"from {end}, after those of other leaves, to {len(splats) - 1}; export it again"
             )
         end = offset + count
         rows.append(np.arange(offset, end))

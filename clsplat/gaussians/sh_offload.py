@@ -68,7 +68,7 @@ class HostTables:
         self.tables[name] = np.ascontiguousarray(rows.reshape(self._block_count, self.lanes, width).transpose(0, 2, 1))
 
     def upload_visible(self, depth_key: Array) -> None:
-        """Upload the visible blocks, and wait.  depth_key: [S], all bits set for culled Gaussians."""
+        """Upload the visible blocks, and wait for the copies.  depth_key: [S], all bits set for culled Gaussians."""
         rows = self._block_count * self.lanes
         is_visible = (depth_key.get()[:rows] != NO_SLOT).reshape(-1, self.lanes).any(axis=1)
         self.load(np.flatnonzero(is_visible))

@@ -13,7 +13,7 @@ from clsplat.render.filters import AT_REST
 
 
 class CovarianceTrace(Penalty):
-    """Mean over Gaussians of max(tr Σ - τ, 0), in extents² (Micro-splatting, Lee et al. 2025).
+    """Mean over Gaussians of max(tr Σ - τ, 0), in units of the squared scene extent (Micro-splatting, Lee et al. 2025).
 
     τ is `above`, or with `pixels`, 3 s², where s is the length of `pixels` pixels in the training view that was nearest
     at the last edit.
@@ -64,7 +64,7 @@ class Anisotropy(Penalty):
 
 
 class MeanScale(Penalty):
-    """Mean of all scales, in extents (3DGS-MCMC, Kheradmand et al. 2024, in scene units there)."""
+    """Mean of all scales, in units of the scene extent (3DGS-MCMC, Kheradmand et al. 2024, uses scene units)."""
 
     type: Literal["mean_scale"] = "mean_scale"
 

@@ -24,7 +24,7 @@ MAX_INITIAL = 1e-4  # largest initial value of an entry (Müller et al. 2022, se
 class GridShape(Settings):
     """A multiresolution hash grid of features (Instant NGP, Müller et al. 2022) with 4 trained features per entry.
 
-    Levels that are finer than a sample are weighted down (Zip-NeRF, Barron et al. 2023, section 3.1).  The features
+    Levels that are finer than a sample are downweighted (Zip-NeRF, Barron et al. 2023, section 3.1).  The features
     are zero outside the grid's cube.
     """
 
@@ -153,7 +153,7 @@ class FieldShape(Settings):
         if self.far <= self.near:
             raise ValueError(f"'far' must be larger than 'near', {self.near:g}; got {self.far:g}")
         if self.skip is not None and self.skip >= self.depth - 1:
-            raise ValueError(f"'skip' must be less than {self.depth - 1}, so that a layer follows, or null")
+            raise ValueError(f"'skip' must be null or less than {self.depth - 1}, so that a layer follows")
         if not self.degrees and self.grid is None:
             raise ValueError("'degrees' must be larger than 0 without a 'grid': the network needs a position as input")
         return self

@@ -85,7 +85,7 @@ def get_platforms() -> list[Any]:
 
 @contextmanager
 def _warn_on_error(message: str, expected_code: str = "") -> Iterator[None]:
-    """Log an OpenCL error of the block as a warning, unless it has the expected code."""
+    """Log an OpenCL error in the block as a warning, unless it has the expected code."""
     try:
         yield
     except cl.Error as error:

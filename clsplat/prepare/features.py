@@ -1,7 +1,7 @@
 """Find SIFT features of photographs (Lowe 2004) with OpenCV, and store them in COLMAP's database.
 
 Images are stored in order of their names, so the same photographs always produce the same database.  The features of
-each photograph are written in one transaction, so a killed call can be resumed with the next photograph.
+each photograph are written in one transaction, so a run after a kill continues with the next photograph.
 """
 
 import logging

@@ -151,7 +151,7 @@ DISTORTION = {  # for each of COLMAP's models: nerfstudio's model, and the names
     "OPENCV_FISHEYE": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
 }
 
-REMEDY = "write colmap, or run `clsplat data undistort` first"
+REMEDY = "use --format colmap, or run `clsplat data undistort` first"
 
 
 def write_nerfstudio(out: Path, scene: Scene) -> list[Path]:
@@ -231,7 +231,7 @@ def check_cameras(scene: Scene, format_: str) -> Scene:
         model, name = view_by_model.popitem()
         other_model = next(iter(view_by_model))
         raise DataError(
-            f"{name}: has the camera model {model}, other views have {other_model}; nerfstudio allows one; {REMEDY}"
+            f"{name}: has the camera model {model}, but others have {other_model}; nerfstudio allows only one; {REMEDY}"
         )
     return renamed_scene
 

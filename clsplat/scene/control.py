@@ -79,7 +79,7 @@ class MarkedPoint:
         position, is_outlier = fit_without_outliers(fit, errors, len(views), 2, MIN_ERROR)
         distances = errors(position)
         if not np.isfinite(distances[~is_outlier]).all():
-            raise DataError(f"point {quote(self.name)}: its marks do not meet in front of the cameras; correct them")
+            raise DataError(f"point {quote(self.name)}: its rays do not meet in front of the cameras; fix its marks")
         rows = zip(self.marks, distances.tolist(), is_outlier.tolist(), strict=True)
         return position, [LocatedMark(*row) for row in rows]
 

@@ -39,7 +39,7 @@ def project_points(view: View, positions: NDArray[np.floating]) -> Floats:
 
 
 def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
-    """Return a scene at full size with the cameras of `views`; the observed pixels of its points do not change."""
+    """Return `scene`, which must be at full size, with the cameras of `views`; the observed pixels do not change."""
     tracks, residuals = scene.tracks, dict[str, Floats]()
     if tracks is not None:
         for old_view, new_view in zip(scene.views, views, strict=True):

@@ -93,7 +93,7 @@ def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tupl
     points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     points = points[rng.permutation(len(points))[:PLANE_POINTS]]
     if len(points) < 3:
-        raise DataError("there are too few points to find the ground; add --scene, or use another option")
+        raise DataError("there are too few points to find the ground; use --level cameras")
     center, thickness = np.median(points, axis=0), THICKNESS * typical_size(points)
     points = points - center
     a, b, c = points[rng.integers(len(points), size=(3, PLANES))]
@@ -103,7 +103,7 @@ def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tupl
     is_level = np.abs(cosines) >= np.cos(MAX_TILT)
     normals, a = (normals * np.sign(cosines)[:, None])[is_level], a[is_level]
     if not len(normals):
-        raise DataError("no plane of the points is level; rotate the scene first, or use another option")
+        raise DataError("no plane through the points is within 45 degrees of level; use --level cameras")
     heights = normals @ points.T - (normals * a).sum(axis=1, keepdims=True)
     scores = (np.abs(heights) < thickness).sum(axis=1) - (heights < -3 * thickness).sum(axis=1)
     normal, height = normals[scores.argmax()], float(normals[scores.argmax()] @ a[scores.argmax()])
@@ -111,7 +111,7 @@ def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tupl
         ground = points[np.abs(points @ normal - height) < 2 * thickness]
         if len(ground) < max(3, MIN_GROUND * len(points)) or normal @ up < np.cos(MAX_TILT):
             raise DataError(
-                f"only {len(ground) / len(points):.1%} of the points are on a level plane; use another option"
+                f"only {len(ground) / len(points):.1%} of the points are on a level plane; use --level cameras"
             )
         axis = np.linalg.svd(ground - ground.mean(axis=0), full_matrices=False)[2][2]
         normal = axis if axis @ normal > 0 else -axis

@@ -122,7 +122,7 @@ class Cameras(Stage):
 
 
 class Checkpoint(Scheduled):
-    """Save the state from which a resumed run gives the same bits; also after the last step, to train longer."""
+    """Save a state from which a resumed run gives the same bits; also after the last step, so a run can be extended."""
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})

@@ -89,7 +89,7 @@ class Timelapse(Stage):
         encoding.check_encoder(Path(self.file))
 
     def _files(self, run: Run) -> list[Path]:
-        """Return the paths of this run's renders, by step; the folder may also contain renders of an earlier run."""
+        """Return the paths of this run's renders, in step order; the folder may also contain those of earlier runs."""
         files = {line["step"]: line["file"] for line in run.records.read(KIND) if line.get("folder") == self.folder}
         return [run.out / self.folder / files[step] for step in sorted(files)]
 

@@ -64,7 +64,7 @@ def read(path: Path) -> tuple[Metadata, Arrays]:
         )
         if isinstance(error, OSError) and error.errno == errno.EIO:
             raise DataError(f"it cannot be read from disk: {error.strerror}") from error
-        raise DataError("is empty" if is_empty else f"cannot be parsed ({reason})") from error
+        raise DataError("it is empty" if is_empty else f"it cannot be parsed ({reason})") from error
 
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:

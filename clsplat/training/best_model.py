@@ -18,7 +18,7 @@ Count = Annotated[int, Field(ge=0)]
 
 
 class Scores(BaseModel):
-    """The mean PSNR of a model over training views, all or a sample, and over the validation views, dB."""
+    """The mean PSNRs of a model, in dB: over all training views or a sample of them, and over the validation views."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
 

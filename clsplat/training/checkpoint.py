@@ -96,7 +96,7 @@ class State(BaseModel):
 def check_tables(state: State, tables: Arrays) -> None:
     """Raise DataError if the tables of Gaussians are incomplete, have wrong shapes, or do not fit the state."""
     if missing_names := [name for name in PARAMETERS if name not in tables]:
-        raise DataError(f"lacks {', '.join(missing_names)}")
+        raise DataError(f"it lacks {', '.join(missing_names)}")
     count = len(tables["means"])
     for name, table in tables.items():
         if table.dtype != np.float32 or table.ndim != 2 or len(table) != count:
@@ -106,7 +106,9 @@ def check_tables(state: State, tables: Arrays) -> None:
     parameters = [*PARAMETERS, *([MOTION] if MOTION in tables else [])]
     for name in parameters:
         if tables[name].shape[1] not in WIDTHS[name]:
-            raise DataError(f"{name} has {tables[name].shape[1]} components")
+            raise DataError(
+                f"{name} has {tables[name].shape[1]} components; expected {' or '.join(map(str, WIDTHS[name]))}"
+            )
         if name == "sh_rest" and tables[name].shape[1] < 3 * (sh_coefficients(state.degree) - 1):
             raise DataError(f"{name} has {tables[name].shape[1]} components, too few for degree {state.degree}")
         moments = [moment for moment in moment_tables(name) if moment in tables]
@@ -465,7 +467,7 @@ def _record_changes(run: Run, path: Path, state: State) -> list[str]:
         is_end = difference.key_path.endswith(".steps")  # an earlier end of the training
         if difference.stage == state.stage_index and state.is_trained(run.pipeline) and not is_end:
             advice = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` trains longer with it"
-            raise ConfigError(f"{path}: no steps are left after step {state.step}: {difference}; {advice}")
+            raise ConfigError(f"{path}: no steps are left for the new setting: {difference}; {advice}")
         changes.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changes]
     return changes

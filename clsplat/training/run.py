@@ -263,7 +263,7 @@ def host_model(run: Run) -> Model:
 
 
 def sky_center(run: Run) -> NDArray[np.float64]:
-    """Return the median camera position, [3]; seen from there, Gaussians of the sky agree with the sky's map."""
+    """Return the median camera position, [3]: the center of the sky Gaussians, from which the sky looks exact."""
     return np.median([view.position for view in run.scene.views], axis=0)
 
 

@@ -35,7 +35,7 @@ def make_room(run: Run, count: int) -> None:
         reason = f", since the device can hold only {capacity:,} Gaussians with harmonics"
     gaussians.move_to_host()
     LOG.info(
-        "step %d: moving SH coefficients to the host%s; training slows down, but its bits stay the same",
+        "step %d: moving SH coefficients to the host%s; training slows down, but its results stay bit-identical",
         run.step,
         reason,
     )

@@ -182,7 +182,7 @@ def _neighbors(means: Floats) -> tuple[Rows, Rows]:
 
 
 def _clipped_tables(model: Model) -> Tables:
-    """Return the tables in float64, with unit quaternions, and with values clipped to the range of the formulas."""
+    """Return float64 tables with unit quaternions, and values clipped so that no derived value overflows."""
     tables = {name: table.astype(np.float64) for name, table in model.tables().items()}
     tables["quats"] = unit(tables["quats"])
     tables["log_scales"] = np.clip(tables["log_scales"], *LOG_SCALES)

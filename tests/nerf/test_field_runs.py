@@ -259,7 +259,7 @@ def test_stages_of_gaussians_are_refused_after_a_field(tmp_path, stage):
     ("keys", "complaint"),
     [
         ({"near": 3.0, "far": 2.0}, "'far' must be larger than 'near'"),
-        ({"skip": 7}, "'skip' must be less than 7"),
+        ({"skip": 7}, "'skip' must be null or less than 7"),
         ({"width": 30}, "multiple of 4"),
         ({"coarse_samples": 20}, "multiple of 16"),
     ],

@@ -51,7 +51,7 @@ def test_fewer_steps_than_trained_are_refused(killed_run, tiny_scene, caplog):
 def test_finished_training_accepts_no_new_values(few_steps, tiny_scene, tmp_path):
     out = shutil.copytree(few_steps, tmp_path / "run")
     before = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
-    words = rf"no steps are left after step 12: .*rates.quats was .*; `clsplat resume {out} --steps 24` trains longer"
+    words = rf"no steps are left for the new setting: .*rates.quats was .*; `clsplat resume {out} --steps 24` trains"
     with pytest.raises(ConfigError, match=words):
         Job.resume(out, ["optimize.rates.quats=1e-5"]).run()
     assert {file: file.read_bytes() for file in before if file.name != "log.txt"} == {

@@ -247,10 +247,10 @@ def test_damaged_checkpoint_is_described_plainly(copy):
     path = copy / "checkpoints" / "step_000020.npz"
     data = bytearray(path.read_bytes())
     path.write_bytes(b"")
-    assert damaged(copy)["checkpoints/step_000020.npz"] == "is empty"
+    assert damaged(copy)["checkpoints/step_000020.npz"] == "it is empty"
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    assert damaged(copy)["checkpoints/step_000020.npz"].startswith("cannot be parsed (")
+    assert damaged(copy)["checkpoints/step_000020.npz"].startswith("it cannot be parsed (")
     said = command("check", copy, expect=7).stderr
     assert "all outputs are intact" in said
     assert "resume" not in said, "it would leave the run as it is"

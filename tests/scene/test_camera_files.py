@@ -109,7 +109,7 @@ def test_nerfstudio_round_trip(model, lenses, scene_of, tmp_path, rng):
 
 @pytest.mark.parametrize("model", sorted(LENSES.keys() - DISTORTION.keys()))
 def test_lens_unknown_to_nerfstudio_is_refused(model, scene_of, tmp_path):
-    with pytest.raises(DataError, match=f"no camera model {model}; write colmap, or run `clsplat data undistort`"):
+    with pytest.raises(DataError, match=f"no camera model {model}; use --format colmap, or run `clsplat data"):
         clsplat.write_cameras(scene_of(model), tmp_path / "out", "nerfstudio")
     assert not (tmp_path / "out").exists()
     stage = SimpleNamespace(original=scene_of(model))
@@ -133,7 +133,7 @@ def test_nerfstudio_has_validation_views_and_one_lens_model(scene_of, tmp_path):
 
 def test_nerfstudio_refuses_mixed_lens_models(scene_of, tmp_path):
     views = [scene_of("OPENCV").views[0], scene_of("OPENCV_FISHEYE").views[4]]
-    with pytest.raises(DataError, match=r"right/4\.png: has the camera model OPENCV_FISHEYE, other views have OPENCV"):
+    with pytest.raises(DataError, match=r"right/4\.png: has the camera model OPENCV_FISHEYE, but others have OPENCV"):
         clsplat.write_cameras(make_scene(tmp_path, views, set(), None), tmp_path / "out", "nerfstudio")
 
 

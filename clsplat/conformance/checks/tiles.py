@@ -97,7 +97,7 @@ def tile_lists(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
-    """Check that each tile lists every splat that reaches it exactly once, front to back, and few other splats."""
+    """Check that each tile lists, exactly once and front to back, every splat that reaches it, and few other splats."""
     rasterizer = Rasterizer(device, sort)
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     lists, tiles, count = frame.lists, frame.camera.tiles, len(case.parameters["means"])

@@ -1,1 +1,1 @@
-"""Inspect datasets: measure facts, derive findings with remedies, and write a page."""
+"""Inspect datasets: measure their properties, derive findings with remedies, and write a page."""

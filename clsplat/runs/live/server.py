@@ -338,7 +338,9 @@ def parse_camera(text: str) -> View:
     fx, fy, cx, cy, width, height = lens
     sides = sorted((width, height))
     if not (math.hypot(*rotation) > 1e-6 and min(fx, fy) > 1e-3 and sides[0] >= 1 and sides[1] <= MAX_SIDE):
-        raise RequestError(400, "camera: expected a rotation, positive focal lengths, and a size")
+        raise RequestError(
+            400, f"camera: expected a nonzero quaternion, focal lengths > 0, and sides from 1 to {MAX_SIDE}"
+        )
     if sides[1] > MAX_ASPECT * sides[0]:
         raise RequestError(400, f"camera: expected an image with an aspect ratio of at most {MAX_ASPECT:.0f}")
     x, y, z, w = (component / math.hypot(*rotation) for component in rotation)
