@@ -42,8 +42,8 @@ class CameraResponse(TrainingModule):
     rate: NonNegative = 1e-3
     """Learning rate (Adam) of the parameters; may be scheduled. Runs of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It leaves what all photos
-    have in common to the Gaussians."""
+    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It leaves the response
+    that all photos share to the Gaussians."""
 
     def create_state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)
@@ -119,7 +119,8 @@ def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Float
     """
     result = workspace.array("grad_response" if grad else "response", image.shape)
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
-    values = workspace.device.upload(np.concatenate([row[2:5], curve_slopes(row).ravel()]).astype(np.float32))
+    numbers = np.concatenate([row[2:5], curve_slopes(row).ravel()]).astype(np.float32)
+    values = workspace.upload("response numbers", numbers)
     center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
     arguments: dict[str, Any] = {"image": image, "gradient": grad or image, "out": result, "row_sums": sums, **center}
     arguments |= {"numbers": values, "channels": image.shape[0], "back": int(grad is not None), "per_px": 1 / half}

@@ -86,6 +86,7 @@ class Buffer(cl.Buffer):
     """A buffer in device memory that, unlike pyopencl's class, supports weak references."""
 
     serial: int  # no other buffer has the same
+    copy: Any  # event of the last copy that nobody waited for
 
 
 _SERIALS = itertools.count(1)
@@ -161,6 +162,14 @@ class Array:
         if host.size:
             with self.device.raising_errors("a copy to the device"):
                 cl.enqueue_copy(self.device.queue, self.buffer, host)
+
+    def set_later(self, values: NDArray[Any]) -> None:
+        """Copy values of the same shape like `set`, but in the order of all commands, without waiting for them."""
+        host = np.array(values, self.dtype).reshape(self.shape)
+        self.device.recording.spoil()
+        with self.device.raising_errors("a copy to the device"):
+            copy = cl.enqueue_copy(self.device.queue, self.buffer, host, is_blocking=False)
+        self.buffer.copy = copy  # pyopencl waits for a copy when its event is deleted
 
     def fill(self, value: float) -> None:
         """Set every value of an array of floats or 32-bit integers."""

@@ -4,6 +4,7 @@ import logging
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -29,7 +30,7 @@ class ViewPool:
         finest = min(view.downscale for view in views)
         self.views, self.seed = views, seed
         self.finest = [i for i, view in enumerate(views) if view.downscale == finest]  # indices into `views`
-        self._epoch, self._permutation = (-1, -1), np.empty(0, np.int64)
+        self._shuffle = lru_cache(maxsize=2)(self._permute)  # the next views may be in the next epoch
 
     def shuffled_view(self, entries: Sequence[int], step: int) -> View:
         """Return the view of a step.  Each epoch visits all `entries`, which index `views`, in a new order."""
@@ -40,11 +41,8 @@ class ViewPool:
         """Return a random number generator that depends only on the seed and the step."""
         return np.random.default_rng([self.seed, step, len(self.views)])
 
-    def _shuffle(self, epoch: int, count: int) -> NDArray[Any]:
-        if self._epoch != (epoch, count):
-            self._epoch = epoch, count
-            self._permutation = np.random.default_rng([self.seed, epoch]).permutation(count)
-        return self._permutation
+    def _permute(self, epoch: int, count: int) -> NDArray[Any]:
+        return np.random.default_rng([self.seed, epoch]).permutation(count)
 
 
 class Order(Settings):

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import DataError
 from clsplat.opencl.device import Array, Device, constants
+from clsplat.render.workspace import Workspace
 from clsplat.scene.view import View
 
 RAY_MARGIN = constants()["RAY_MARGIN"]
@@ -38,6 +39,7 @@ class DeviceCamera:
     tile: int
     view: int | None = None  # index in the table HIDDEN; None renders all Gaussians
     time: float | None = None  # of the scene, in [0, 1], at which moving Gaussians are rendered
+    source: View | None = field(default=None, repr=False, compare=False)  # whose values it has
     values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host
 
     @property
@@ -64,8 +66,13 @@ class DeviceCamera:
         return {"width": self.width, "height": self.height, "rows": self.rows, "stride": self.stride}
 
 
-def move_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoom: float = 1.0) -> DeviceCamera:
-    """Return a camera with another pose, [3, 4], and focal lengths times `zoom`.  The plane size does not change."""
+def move_camera(
+    workspace: Workspace, camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoom: float = 1.0
+) -> DeviceCamera:
+    """Return a camera with another pose, [3, 4], and focal lengths times `zoom`.  The plane size does not change.
+
+    It is valid until the next call.
+    """
     values = camera.values.copy()
     for name in ("fx", "fy"):
         values[name] = float(values[name]) * zoom
@@ -73,15 +80,17 @@ def move_camera(camera: DeviceCamera, world_to_camera: NDArray[np.floating], zoo
         values[name] = float(values[name]) / zoom
     values["world_to_camera"] = world_to_camera.ravel()
     values["position"] = -world_to_camera[:, :3].T @ world_to_camera[:, 3]
-    return replace(camera, array=camera.array.device.upload(values.reshape(1)), values=values)
+    return replace(camera, array=workspace.upload("moved camera", values.reshape(1)), values=values, source=None)
 
 
 def update_camera(camera: DeviceCamera, view: View) -> DeviceCamera:
     """Return `camera` with the values of a view of the same image size.  They are uploaded only if they differ."""
+    if view is camera.source:
+        return camera
     values = camera_values(view, camera.tile)
     if values == camera.values:
-        return camera
-    return replace(camera, array=camera.array.device.upload(values.reshape(1)), values=values)
+        return replace(camera, source=view)
+    return replace(camera, array=camera.array.device.upload(values.reshape(1)), values=values, source=view)
 
 
 def upload_camera(device: Device, view: View) -> DeviceCamera:
@@ -91,7 +100,7 @@ def upload_camera(device: Device, view: View) -> DeviceCamera:
     tiles_x, tiles_y = int(values["tiles_x"]), int(values["tiles_y"])
     array = device.upload(values.reshape(1))
     size = view.camera.width, view.camera.height, tiles_x, tiles_y
-    return DeviceCamera(array, *size, tile, time=view.time, values=values)
+    return DeviceCamera(array, *size, tile, time=view.time, source=view, values=values)
 
 
 def camera_values(view: View, tile: int) -> NDArray[Any]:

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 
 from clsplat.core.errors import MemoryLimitError
 from clsplat.opencl.device import Array, Device
@@ -42,6 +42,16 @@ class Workspace:
                 else self.device.zeros(length, value_type)
             )
         return Array(self.device, array.buffer, shape, value_type)
+
+    def upload(self, name: str, values: NDArray[Any]) -> Array:
+        """Return an array with values from the host, without waiting for earlier commands, which may still read it.
+
+        values: of 4 bytes each, or structs of them.
+        """
+        words = self.array(name, values.nbytes // 4, np.uint32)
+        array = Array(self.device, words.buffer, values.shape, values.dtype)
+        array.set_later(values)
+        return array
 
     def _allocate_with_slack(self, length: int, dtype: np.dtype[Any], slack: float) -> Array:
         """Allocate an array with slack for growth, if the device has enough memory."""

@@ -121,7 +121,7 @@ def test_gain_is_the_largest_change_over_all_directions(device, rng, count):
     frame = Rasterizer(device, "radix").forward(model, camera, device.zeros(3))
     gradient = rng.normal(size=(2, model.gaussians.capacity)).astype(np.float32)
     stats, black = SplatStats(model.gaussians, ["gain"]), np.zeros((3, 32, 48), np.float32)
-    stats.add(ViewGradients(frame, make_comparison(device, black, black), [], None), device.upload(gradient))
+    stats.add(ViewGradients(frame, make_comparison(device, black, black), [], device.zeros(1)), device.upload(gradient))
     expected, angles = np.zeros(count), np.linspace(0, 2 * np.pi, 1000)
     splats = case.project()
     blended = frame.splats.get()[:count].any(axis=1)  # zero where no pixel of the image shows it

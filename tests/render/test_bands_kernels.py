@@ -204,3 +204,16 @@ def test_row_of_tiles_with_too_many_pairs_is_refused(device, rng, monkeypatch):
     case = random_case(rng, 300, 60, 70)
     with pytest.raises(MemoryLimitError, match=r"60x70 px .*more than 50 .*; use smaller images, or fewer"):
         results(device, case, 0.0)
+
+
+@on_one_setting
+def test_uploads_keep_the_order_of_commands(device, rng):
+    """Each launch reads the values that were uploaded before it, although all uploads share an array."""
+    workspace, order = Workspace(device), device.upload(np.arange(1000, dtype=np.uint32))
+    values = [rng.integers(0, 100, 1000).astype(np.uint32) for _ in range(20)]
+    results = [device.zeros(1000, np.uint32) for _ in values]
+    for expected, result in zip(values, results, strict=True):
+        array = workspace.upload("values", expected)
+        device.program("scan.cl").permute(items=1000, values=array, order=order, permuted=result, count=1000)
+    for expected, result in zip(values, results, strict=True):
+        np.testing.assert_array_equal(result.get(), expected)

@@ -12,6 +12,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.schedule import at_step
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import camera_values, move_camera, upload_camera
+from clsplat.render.workspace import Workspace
 from clsplat.runs.model_file import write_cameras
 from clsplat.scene.camera import Camera, Lens
 from clsplat.scene.detect import read_scene
@@ -96,7 +97,7 @@ def test_rates_follow_the_visits_of_a_camera():
 
 def test_device_camera_gets_its_rays_from_its_focal_length(device):
     view = View("a", Camera(70, 50, 60.0, 62.0, 33.0, 26.0), np.eye(3, 4))
-    camera = move_camera(upload_camera(device, view), view.world_to_camera, 1.02)
+    camera = move_camera(Workspace(device), upload_camera(device, view), view.world_to_camera, 1.02)
     expected = camera_values(replace(view, camera=view.camera.zoomed(1.02)), camera.tile)
     for name in expected.dtype.names or ():
         np.testing.assert_allclose(camera.values[name], expected[name], rtol=2e-7, err_msg=name)

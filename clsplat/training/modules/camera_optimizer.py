@@ -205,7 +205,7 @@ class CameraState(ModuleState):
     def before_render(self, step: TrainingStep) -> None:
         if step.view is not None and step.number > self.settings.start:
             zoom, pose = self.factor(self.views[step.view].name), self.pose(step.view)
-            step.photograph = replace(step.photograph, camera=move_camera(step.camera, pose, zoom))
+            step.photograph = replace(step.photograph, camera=move_camera(step.workspace, step.camera, pose, zoom))
 
     def after_backward(self, step: TrainingStep) -> None:
         if step.view is not None and step.number > self.settings.start:

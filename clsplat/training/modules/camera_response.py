@@ -125,7 +125,8 @@ def respond(workspace: Workspace, camera: DeviceCamera, image: Array, row: Float
     """
     result = workspace.array("grad_response" if grad else "response", image.shape)
     sums, half = workspace.array("response sums", (20, camera.rows)), float(np.hypot(camera.width, camera.height)) / 2
-    values = workspace.device.upload(np.concatenate([row[2:5], curve_slopes(row).ravel()]).astype(np.float32))
+    numbers = np.concatenate([row[2:5], curve_slopes(row).ravel()]).astype(np.float32)
+    values = workspace.upload("response numbers", numbers)
     center = {f"center_{x}": float(camera.values[f"c{x}"] + half * shift) for x, shift in zip("xy", row, strict=False)}
     arguments: dict[str, Any] = {"image": image, "gradient": grad or image, "out": result, "row_sums": sums, **center}
     arguments |= {"numbers": values, "channels": image.shape[0], "back": int(grad is not None), "per_px": 1 / half}

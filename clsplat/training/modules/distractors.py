@@ -109,7 +109,8 @@ class DistractorsState(ModuleState):
             return
         camera, gaussians = step.camera, self.adams[self._rows[step.view]].gaussians
         model = replace(step.model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
-        frame = self.rasterizer.forward(model, move_camera(camera, np.eye(3, 4)), self._black)
+        moved_camera = move_camera(self.rasterizer.workspace, camera, np.eye(3, 4))
+        frame = self.rasterizer.forward(model, moved_camera, self._black)
         scale = at_step(self.settings.cover, step.number) / (camera.width * camera.height)
         layer = composite_layer(step.workspace, frame, step.image, scale)
         step.image = layer.image

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from clsplat.opencl.device import Array, Device
 from clsplat.scene.quality import has_visible_background
 from clsplat.scene.scene import Scene
 from clsplat.training.modules.base import ModuleState, TrainingModule, TrainingStep
@@ -33,18 +33,18 @@ class RandomBackground(TrainingModule):
         if self.when == "transparent":
             LOG.info("training with a random background, since photos have transparent pixels")
         run.photographs.enable_transparency()
-        return RandomBackgroundState(run.device, run.seed)
+        return RandomBackgroundState(run.seed)
 
 
 class RandomBackgroundState(ModuleState):
-    def __init__(self, device: Device, seed: int) -> None:
+    def __init__(self, seed: int) -> None:
         super().__init__()
-        self.device, self.seed = device, seed
+        self.seed = seed
 
     def before_render(self, step: TrainingStep) -> None:
-        step.background = random_color(self.device, self.seed, step.number)
+        step.background = step.workspace.upload("random background", random_color(self.seed, step.number))
 
 
-def random_color(device: Device, seed: int, step: int) -> Array:
+def random_color(seed: int, step: int) -> NDArray[np.float32]:
     """Draw the background color of a global step, [3] in [0, 1)."""
-    return device.upload(np.random.default_rng([seed, step]).random(3, np.float32))
+    return np.random.default_rng([seed, step]).random(3, np.float32)
