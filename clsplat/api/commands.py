@@ -455,6 +455,8 @@ def convert(
     crop: str | Sequence[float] | None = None,
     transform: str | None = None,
     drop_below: float = 0.0,
+    filter_floaters: bool = False,
+    level: bool = False,
     time: float | None = None,
     frames: int | None = None,
     world: bool = False,
@@ -466,6 +468,8 @@ def convert(
     crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`
     transform: such as "scale=2 rotate=90,0,0" (degrees)
     drop_below: drop Gaussians with a lower opacity
+    filter_floaters: drop Gaussians that are large and faint, isolated, or far outside; needs no photos
+    level: turn the model so that its ground is at y = 0 and up is -y; the ground must be within 45 degrees of that
     time: write a moving model as a static model at this time, in [0, 1]
     frames: write this number of static files at evenly spaced times: PLY files in the folder `out`, or files named
         `out` with a number added
@@ -481,7 +485,9 @@ def convert(
     box = crop if isinstance(crop, str) or crop is None else ",".join(map(str, crop))
     changes = conversion.Changes(
         drop_below,
+        filter_floaters,
         None if transform is None else conversion.parse_transform(transform),
+        level,
         None if box is None else conversion.parse_crop(box),
         conversion.check_degree(sh_degree),
         check_time(time),

@@ -146,6 +146,12 @@ def convert(
     drop_below: Annotated[
         float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians with a lower opacity.")
     ] = 0.0,
+    filter_floaters: Annotated[
+        bool, typer.Option("--filter-floaters", help="Drop large and faint, isolated, and far Gaussians.")
+    ] = False,
+    level: Annotated[
+        bool, typer.Option("--level", help="Turn the model upright: its ground at y = 0, up is -y.")
+    ] = False,
     time: Annotated[
         float | None, typer.Option(metavar="T", help="Dynamic model: write it at this time, 0 to 1.")
     ] = None,
@@ -164,6 +170,8 @@ def convert(
         crop=crop,
         transform=transform,
         drop_below=drop_below,
+        filter_floaters=filter_floaters,
+        level=level,
         time=time,
         frames=frames,
         world=world,
@@ -176,7 +184,7 @@ def convert(
 @command(
     "align",
     "clsplat align my_scene leveled --level cameras",
-    "clsplat align runs/splat_7k metric.ply --distance 'a.jpg:812,403+b.jpg:790,410;1.2,0,3.4=1.25'",
+    "clsplat align runs/splat_7k metric.ply --distance '0,0,1;1.2,0,3.4=1.25'",
     "clsplat align my_scene on_map --gps",
     "clsplat align my_scene surveyed --control points.csv",
 )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError, quote
 from clsplat.core.files import check_not_run_file, path_exists, raising_output_error, scratch_folder
+from clsplat.core.quaternions import rotation_matrix
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
     EXPECTED_TIME,
@@ -28,6 +29,7 @@ from clsplat.formats.splats import (
     WriteOptions,
     is_timestamp,
     sh_coefficients,
+    unit,
     with_degree,
 )
 from clsplat.formats.table import format_from_name, model_bytes, writing_format
@@ -35,6 +37,8 @@ from clsplat.gaussians.model import Model, exported_model, load, model_path
 from clsplat.gaussians.motion import static_motion, with_motion
 from clsplat.gaussians.sky import sample_texels, sky_path
 from clsplat.scene.scene import PointCloud
+from clsplat.scene.similarity import UP, level
+from clsplat.scene.viewpoint import ground_plane
 
 # Merging models.
 
@@ -85,7 +89,9 @@ class Changes:
     """Changes to a model, applied in this order."""
 
     drop_below: float = 0.0  # opacity below which Gaussians are dropped
+    filter_floaters: bool = False
     transform: NDArray[np.float64] | None = None  # [4, 4], a uniform scale, rotation, and translation
+    level: bool = False  # turn the model so that its ground is at y = 0, with up = -y
     crop: tuple[float, ...] | None = None  # x0, y0, z0, x1, y1, z1, world coordinates; Gaussians outside are dropped
     sh_degree: int | None = None  # higher bands are dropped
     time: float | None = None  # of a moving model: the timestamp to extract
@@ -95,12 +101,16 @@ class Changes:
         """Return the converted model.  Raises DataError if no Gaussian remains, ConfigError for extreme transforms."""
         model = model if self.time is None else _extract_frame(model, self.time)
         result = model[model.opacities >= self.drop_below] if self.drop_below else model
+        if self.filter_floaters:
+            result = without_floaters(result)
         if self.transform is not None:
             scale = round(float(np.cbrt(np.linalg.det(self.transform[:3, :3]))), 12)
             try:
                 result = result.transformed(scale, self.transform[:3, :3] / scale, self.transform[:3, 3])
             except ValueError as error:
                 raise ConfigError(f"--transform: {error}") from error
+        if self.level:
+            result = leveled(result)
         if self.crop is not None:
             low, high = np.array(self.crop, np.float64).reshape(2, 3) - result.origin
             result = result[((result.means >= low) & (result.means <= high)).all(axis=1)]
@@ -110,6 +120,91 @@ class Changes:
             fault = f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold"
             raise DataError(fault if len(model) else "the model has no Gaussians, or none with valid values")
         return result
+
+
+SOLID = 0.5  # opacity of the Gaussians that may be ground
+
+
+def solid_means(model: Model) -> NDArray[np.float32]:
+    """Return the means of the opaque Gaussians that are not sky, [M, 3]."""
+    return model.means[model.is_scene & (model.opacities >= SOLID)]
+
+
+def leveled(model: Model) -> Model:
+    """Return a model turned about its center so that its ground is at y = 0 and up is -y.
+
+    Raises DataError if it has no ground within 45 degrees of level.
+    """
+    points = solid_means(model)
+    up, height = ground_plane(points, UP)
+    transform = level(up, np.median(points, axis=0) + model.origin, height + float(up @ model.origin))
+    LOG.info("the ground was tilted by %.1f degrees", math.degrees(math.acos(min(1.0, float(up @ UP)))))
+    return model.transformed(1.0, transform.rotation, transform.translation)
+
+
+# Floaters, found without photos.
+
+NEIGHBORS = 16
+REACH = 2.0  # standard deviations within which two Gaussians touch
+MIN_GROUP = 10  # Gaussians that touch each other; smaller groups are isolated
+LARGE, FAINT = 8.0, 0.3  # times the size of the neighbors, and opacity
+MAX_FLOATERS = 0.25  # fraction of the Gaussians
+OUTSIDE = 3.0  # times the 99th percentile of the distances from the center
+
+
+def without_floaters(model: Model) -> Model:
+    """Return a model without floaters, and log their number.  Sky Gaussians are kept.
+
+    Floaters are large and faint compared with their neighbors, belong to small groups that touch nothing else, or are
+    far outside.  Raises ConfigError for a moving model, and DataError if these are many of the Gaussians.
+    """
+    if model.motion is not None:
+        raise ConfigError("--filter-floaters needs a static model; add --time T")
+    rows = np.flatnonzero(model.is_scene)
+    if len(rows) <= NEIGHBORS:
+        return model
+    is_faint, is_isolated, is_outside = _floaters(model[rows])
+    is_floater = is_faint | is_isolated | is_outside
+    if is_floater.mean() > MAX_FLOATERS:
+        raise DataError(
+            f"{is_floater.mean():.0%} of the Gaussians would be floaters, because few touch each other; "
+            "omit --filter-floaters"
+        )
+    LOG.info(
+        "removed %s of %s Gaussians as floaters: %s large and faint, %s isolated, %s far outside",
+        *(
+            f"{count:,}"
+            for count in (is_floater.sum(), len(model), is_faint.sum(), is_isolated.sum(), is_outside.sum())
+        ),
+    )
+    is_kept = np.ones(len(model), np.bool_)
+    is_kept[rows[is_floater]] = False
+    return model[is_kept]
+
+
+def _floaters(model: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return masks, [N], of Gaussians that are large and faint, of other isolated ones, and of others far outside."""
+    means, scales = model.means.astype(np.float64), model.scales.astype(np.float64)
+    center_distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    is_outside = center_distances > OUTSIDE * np.quantile(center_distances, 0.99)
+    distances, neighbors = scipy.spatial.cKDTree(means).query(means, k=NEIGHBORS + 1, workers=-1)
+    distances, neighbors = distances[:, 1:], neighbors[:, 1:]
+    size = scales.max(axis=1)
+    is_faint = (size > LARGE * np.median(size[neighbors], axis=1)) & (model.opacities < FAINT)
+    axes = rotation_matrix(*unit(model.quats).T) * scales[:, None]
+    pairs = []
+    for distance, neighbor in zip(distances.T, neighbors.T, strict=True):
+        direction = (means[neighbor] - means) / np.maximum(distance, 1e-300)[:, None]
+        reach = sum(
+            np.linalg.norm(np.einsum("nij,ni->nj", axes[i], direction), axis=1) for i in (slice(None), neighbor)
+        )
+        touches = np.flatnonzero((distance <= REACH * reach) & ~is_faint & ~is_faint[neighbor])
+        pairs.append(np.stack([touches, neighbor[touches]]))
+    first, second = np.concatenate(pairs, axis=1)
+    graph = scipy.sparse.coo_array((np.ones(len(first)), (first, second)), shape=(len(means), len(means)))
+    group = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    is_isolated = ~is_faint & (np.bincount(group)[group] < MIN_GROUP)
+    return is_faint, is_isolated, is_outside & ~is_faint & ~is_isolated
 
 
 def writing_options(out: Path, quality: Quality, changes: Changes) -> WriteOptions:

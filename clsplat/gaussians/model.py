@@ -197,12 +197,17 @@ class Model:
         return columns_to_sh_degree(self.sh_rest.shape[1])
 
     @property
+    def is_scene(self) -> NDArray[np.bool_]:
+        """A mask, [N], of the Gaussians that are not sky."""
+        if self.rendering.notes.get("sky") != "splats":
+            return np.ones(len(self), np.bool_)
+        means = self.means.astype(np.float64)
+        return is_before_gap(np.linalg.norm(means - np.median(means, axis=0), axis=1))
+
+    @property
     def scene_means(self) -> Floats:
         """The means, [N, 3], without those of sky Gaussians."""
-        if self.rendering.notes.get("sky") != "splats":
-            return self.means
-        means = self.means.astype(np.float64)
-        return self.means[is_before_gap(np.linalg.norm(means - np.median(means, axis=0), axis=1))]
+        return self.means[self.is_scene]
 
     @property
     def near(self) -> float:

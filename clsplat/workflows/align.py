@@ -14,7 +14,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.text_table import text_table
 from clsplat.formats.splats import WriteOptions
 from clsplat.formats.table import format_from_name, model_file
-from clsplat.gaussians.conversion import check_output, write_model
+from clsplat.gaussians.conversion import check_output, solid_means, write_model
 from clsplat.gaussians.model import Model, load, model_path
 from clsplat.runs.model_file import ModelSource, find_run, refuse_field
 from clsplat.runs.state import has_pipeline
@@ -29,7 +29,6 @@ from clsplat.training.modules.base import apply_side_files
 LOG = logging.getLogger("clsplat")
 Floats = NDArray[np.float64]
 Level = Literal["cameras", "ground"]
-SOLID = 0.5  # opacity of the Gaussians that may be ground
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class Subject:
             return up_direction(views), np.median([view.position for view in views], axis=0), None
         expected_up = up_direction(self.scene.views) if self.scene else UP
         if self.model is not None:
-            points = self.model.scene_means[self.model.opacities[: len(self.model.scene_means)] >= SOLID]
+            points = solid_means(self.model)
         elif self.scene and self.scene.points:
             points = self.scene.points.positions
         else:
