@@ -76,7 +76,7 @@ def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
 
 
-MAX_TILT = np.radians(45)  # of a ground plane, from the expected up direction
+MAX_SLOPE = np.radians(45)  # of a ground plane, from the expected up direction
 PLANES, PLANE_POINTS = 2000, 5000  # candidates, each through three points, and points to compare them with
 THICKNESS = 0.015  # of the ground, relative to the typical size of the points
 MIN_GROUND = 0.1  # fraction of the points
@@ -100,7 +100,7 @@ def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tupl
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     cosines = normals @ up
-    is_level = np.abs(cosines) >= np.cos(MAX_TILT)
+    is_level = np.abs(cosines) >= np.cos(MAX_SLOPE)
     normals, a = (normals * np.sign(cosines)[:, None])[is_level], a[is_level]
     if not len(normals):
         raise DataError("no plane through the points is within 45 degrees of level; use --level cameras")
@@ -109,7 +109,7 @@ def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tupl
     normal, height = normals[scores.argmax()], float(normals[scores.argmax()] @ a[scores.argmax()])
     for _ in range(REFINEMENTS):
         ground = points[np.abs(points @ normal - height) < 2 * thickness]
-        if len(ground) < max(3, MIN_GROUND * len(points)) or normal @ up < np.cos(MAX_TILT):
+        if len(ground) < max(3, MIN_GROUND * len(points)) or normal @ up < np.cos(MAX_SLOPE):
             raise DataError(
                 f"only {len(ground) / len(points):.1%} of the points are on a level plane; use --level cameras"
             )

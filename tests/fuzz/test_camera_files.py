@@ -50,7 +50,9 @@ def test_damaged_control_points_are_read_or_refused(folder):
     def reads(data):
         (folder / "points.csv").write_bytes(data)
         for point in (outcome(read_control, folder / "points.csv") or {}).values():
-            assert np.isfinite([*(point.known or ()), *(value for mark in point.marks for value in mark.pixel)]).all()
+            assert np.isfinite(
+                [*(point.coordinates or ()), *(value for mark in point.marks for value in mark.pixel)]
+            ).all()
 
     reads()
 

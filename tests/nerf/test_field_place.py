@@ -65,7 +65,7 @@ def test_message_reports_the_scene_position(tmp_path):
     scene = scene_of(tmp_path, *views)
     shape = FieldShape(unit=1.0, near=NEAR, far=FAR, grid=GridShape(corner=[20.0, 0.0, 0.0], side=1.0))
     with pytest.raises(
-        ConfigError, match=r"train_field\.field\.grid: .* at depths from 1 to 3, .* the cameras look at \(1, 2, 3\)"
+        ConfigError, match=r"train_field\.field\.grid: .* at depths from 1 to 3; .* the cameras .* look at \(1, 2, 3\)"
     ):
         require_visible_grid(shape, scene)
     require_visible_grid(shape.model_copy(update={"grid": None}), scene)

@@ -151,7 +151,7 @@ def test_dry_run_estimates_the_training_time(tiny_scene, tmp_path, pipeline):
 
 def test_field_trains_for_a_time_budget(tiny_scene, tmp_path, pipeline, monkeypatch):
     """Schedules of the rate are stretched as those of Gaussians, and the pipeline that is written repeats the bits."""
-    rehearsal = Rehearsal(12, [0.01], during=0.0, after=0.0)
+    rehearsal = Rehearsal(12, [0.01], overhead=0.0, after=0.0)
     monkeypatch.setattr("clsplat.runs.time_budget.rehearse_enough", lambda *given: rehearsal)
     monkeypatch.setattr(Rehearsal, "steps_in", lambda *given: 24)
     out = clsplat.run(pipeline, tiny_scene, tmp_path / "run", minutes=0.002)

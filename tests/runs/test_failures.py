@@ -9,8 +9,8 @@ import pytest
 from clsplat.core.errors import DataError, DeviceError, InternalError, OutputError, as_clsplat_error
 from clsplat.density import control
 from clsplat.density.statistics import SplatStats
-from clsplat.opencl.device import Kernel
 from clsplat.photos.photographs import Photographs
+from clsplat.render.rasterizer import Rasterizer
 from clsplat.stages.evaluate import Evaluate
 from clsplat.stages.report import HtmlReport
 from clsplat.sweeps.experiment import Job
@@ -23,8 +23,8 @@ pytestmark = pytest.mark.slow
 
 def fail_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exception]:
     """Make a run fail in a step, at a given point of it."""
-    counts = {"photograph": 0, "kernel": 0}
-    get, call = Photographs.get, Kernel.__call__
+    counts = {"photograph": 0, "frame": 0}
+    get, start_forward, is_complete = Photographs.get, Rasterizer.start_forward, Rasterizer.is_complete
 
     def photograph(photographs, view):
         counts["photograph"] += 1
@@ -32,17 +32,21 @@ def fail_at(step: int, monkeypatch: pytest.MonkeyPatch, where: str) -> type[Exce
             raise DataError("the photo is damaged")
         return get(photographs, view)
 
-    def kernel(one, **values):
-        if one.label.endswith(":blend_forward"):
-            counts["kernel"] += 1
-            if counts["kernel"] == step:
-                raise DeviceError("the device is lost for a moment")
-        return call(one, **values)
+    def kernel(rasterizer, *arguments, **others):
+        if counts["frame"] == step - 1:
+            raise DeviceError("the device is lost for a moment")
+        return start_forward(rasterizer, *arguments, **others)
+
+    def count_frames(rasterizer, frame):
+        fits = is_complete(rasterizer, frame)
+        counts["frame"] += fits
+        return fits
 
     if where == "photograph":
         monkeypatch.setattr(Photographs, "get", photograph)
         return DataError
-    monkeypatch.setattr(Kernel, "__call__", kernel)
+    monkeypatch.setattr(Rasterizer, "start_forward", kernel)
+    monkeypatch.setattr(Rasterizer, "is_complete", count_frames)
     return DeviceError
 
 

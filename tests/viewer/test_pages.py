@@ -103,7 +103,7 @@ def test_every_template_file_is_part_of_a_page():
 
 
 def test_values_are_escaped_and_charts_are_not():
-    values = {"state": "ready", "verdict": HOSTILE, "findings": [], "figures": {HOSTILE: HOSTILE}, "cameras": []}
+    values = {"state": "ready", "verdict": HOSTILE, "findings": [], "facts": {HOSTILE: HOSTILE}, "cameras": []}
     chart = curve(HOSTILE, [Line([(0.0, 0.0), (1.0, 1.0)])])
     seen = mark_charts_safe([chart, ""]), [(HOSTILE, 3)]
     page = Page(
@@ -143,7 +143,7 @@ def test_data_cannot_close_its_script():
 
 def test_name_that_is_not_unicode_shows_a_question_mark():
     page = render("inspect.html.j2", title="\udcff.png", subtitle="", state="ready", verdict="", findings=[],
-                  figures={}, cameras=[], far="", points_per_view=None, lists=[])  # fmt: skip
+                  facts={}, cameras=[], far="", points_per_view=None, lists=[])  # fmt: skip
     assert "<title>?.png</title>" in page
 
 
