@@ -95,7 +95,8 @@ def check_sums(expected: list[str], path: Path) -> str:
 def check_output(expected: str | None, path: Path) -> str:
     """Check an output file, and return its description.
 
-    Raises DataError if its checksum differs, and the errors of its reader.
+    expected: the checksum of the file.  Raises DataError if the file has a different checksum, and the errors of the
+    file's reader.
     """
     require_sum(expected, path)
     if path.name == METRICS:
@@ -140,8 +141,8 @@ def verify(state: RunState) -> dict[str, Any]:
 def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool = False) -> Iterator[dict[str, Any]]:
     """Yield the result for each file of a run, or of all cells of a matrix.
 
-    cells: receives the states of the cells' folders, by name.  expect_all: whether all files of a finished run have to
-    exist.
+    cells: a dictionary to which the states of the cells' folders are added, by name.  expect_all: whether all files of
+    a finished run must exist.
     """
     out, names, status, sums = state.out, state.names, state.status, state.sums or {}
     settings: dict[str, Any] = {}
@@ -219,7 +220,7 @@ def verdict(result: dict[str, Any]) -> str:
 
 
 def _remedy(state: RunState, verified: dict[str, Any]) -> str:
-    """Return advice on how to restore the files of a run: from an intact checkpoint, or by starting it again."""
+    """Return advice on how to restore the files of a run: from an intact checkpoint, or by a new start of the run."""
     if state.phase is Phase.DONE and "cells" not in state.status and not state.bad_files and PIPELINE in state.names:
         return "ignore them: all outputs are intact, and only longer training needs these files"
     intact_files = {Path(verified["run"], entry["file"]) for entry in verified["objects"] if entry["whole"]}
@@ -246,10 +247,13 @@ def format_files(result: dict[str, Any]) -> str:
 
 
 def check(pipeline: str) -> dict[str, Any]:
-    """Check a pipeline, matrix, run folder, model, or field, given by its path, or a shipped pipeline, by its name.
+    """Check the pipeline, matrix, run folder, model, or field at a path, or the shipped pipeline with this name.
 
-    Returns the path, the name, the stages, and the undecided keys of a pipeline; the path, the name, and the cells of a
-    matrix; the result of `verify` for a run folder or of `examine` for a model; or the number of parameters of a field.
+    Returns a dictionary that depends on what was checked:
+    pipeline: its `path`, `name`, and `stages`, and the keys whose values `adapt` will choose (`adapts`)
+    matrix: its `path`, `name`, and `cells`
+    run folder, model: the result of `verify` or `examine`
+    field: its `path` and `name`, and its number of `parameters`
     Raises ConfigError, and DataError for a folder without a run.
     """
     if is_field(Path(pipeline)) and path_exists(Path(pipeline)):

@@ -116,7 +116,7 @@ def make_video(
 
 
 def _read(model: Path) -> AnyModel:
-    """Read the model of a file or a run folder, without its photos."""
+    """Read the model from a file or a run folder.  No photos are read."""
     file = trained_file(model) if has_pipeline(model) else model
     return read(file if is_field(file) else model)
 
@@ -179,7 +179,7 @@ def view(
     photograph_budget: float = BUDGET,
     splats: int | None = None,
 ) -> Path:
-    """Write a viewer page that shows one model, or two side by side; return its path.  Raises ClsplatError.
+    """Write a viewer page that shows one or two models, side by side; return the page's path.  Raises ClsplatError.
 
     scene: dataset or run folder whose views and photos the page includes; default: the scene of the first model that is
     from a run.

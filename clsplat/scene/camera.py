@@ -232,17 +232,20 @@ class Lens:
 
     @cached_property
     def faces(self) -> tuple["Lens", ...]:
-        """The lenses of the faces of a wide photograph: the front, and those with at least MIN_VISIBLE in view."""
+        """The lenses of the faces of a wide photograph.
+
+        They are the front, and each other face of which at least a fraction MIN_VISIBLE is visible in the photograph.
+        """
         lenses = [intern_lens(replace(self, face=face, keep_border=self.model != "EQUIRECTANGULAR")) for face in FACES]
         return tuple(lens for lens in lenses if lens.face == "front" or lens._visible_grid.mean() >= MIN_VISIBLE)
 
     @cached_property
     def _visible_grid(self) -> NDArray[np.bool_]:
-        """Which points of `_face_grid` are visible in the photograph, [FACE_GRID, FACE_GRID]."""
+        """A mask, [FACE_GRID, FACE_GRID], of the points of `_face_grid` that are visible in the photograph."""
         return self._is_visible(*_face_grid())
 
     def _directions(self, u: Floats, v: Floats) -> tuple[Floats, Floats, Floats]:
-        """Convert normalized coordinates of the face to directions x, y, z in the camera of the photograph."""
+        """Convert normalized coordinates of the face to directions x, y, z in the photograph's camera space."""
         x, y, z = np.moveaxis(np.stack([u, v, np.ones_like(u)], axis=-1) @ FACES[self.face or "front"], -1, 0)
         return x, y, z
 
@@ -267,9 +270,10 @@ class Lens:
         return bool((mask[np.minimum(rows, height - 1), np.minimum(columns, width - 1), 0] > 0).any())
 
     def _face_camera(self) -> Camera:
-        """Return the camera of a face, cropped to the smallest rectangle with all pixels visible in the photograph.
+        """Return the camera of a face, cropped to the bounding box of the pixels that are visible in the photograph.
 
-        At the center, its pixels are as large as those of the photograph.  Raises DataError for an implausible camera.
+        At the center, the pixels of the face are as large as those of the photograph.  Raises DataError for an
+        implausible camera.
         """
         focal = max(self._intrinsics[:2])
         side = 2 * math.ceil(FACE_TANGENT * focal)
@@ -347,8 +351,8 @@ class Lens:
         """The camera of the undistorted photograph, with the same focal lengths.
 
         Its image is the largest rectangle in which all pixels are defined.  With `keep_border`, it is the smallest
-        rectangle that contains the photograph, up to 60 degrees to each side and twice the size.  For a wide
-        photograph, it is the camera of the face.  Raises DataError if there is no such rectangle.
+        rectangle that contains the photograph, limited to 60 degrees on each side and to twice the photograph's size.
+        For a wide photograph, the result is the camera of the face.  Raises DataError if no pixels are left.
         """
         if self.is_wide:
             return self._face_camera()
@@ -383,7 +387,10 @@ class Lens:
 
     @cached_property
     def visible_pixels(self) -> NDArray[np.bool_]:
-        """A mask, [H, W], of the pixels of `pinhole` that the photograph covers: their rays map into it and back."""
+        """A mask, [H, W], of the pixels of `pinhole` that the photograph covers.
+
+        The ray of such a pixel maps into the photograph, and `undistort` maps it back.
+        """
         if self.is_wide:
             return np.concatenate([self._is_visible(u, v) for _, u, v in self._blocks(1)])
         u, v = _rays(self.pinhole)
@@ -394,7 +401,10 @@ class Lens:
 
 
 def _rays(camera: Camera, rows: slice = slice(0, MAX_SIDE), samples: int = 1) -> tuple[Floats, Floats]:
-    """Return the normalized coordinates of `samples` x `samples` rays per pixel in some rows, [H, W] each."""
+    """Return the normalized coordinates u and v of `samples` x `samples` rays per pixel of the given rows.
+
+    Each is an array, [H * samples, W * samples].
+    """
     x, y = ((np.arange(size * samples) + 0.5) / samples for size in (camera.width, camera.height))
     y = y[rows.start * samples : rows.stop * samples]
     u, v = np.meshgrid((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
@@ -409,7 +419,7 @@ def _face_grid() -> tuple[Floats, Floats]:
 
 
 def panorama_lens(width: int, height: int) -> Lens:
-    """Return the lens of a panorama of the full sphere.  The center of the image is forward, and its top is up."""
+    """Return the lens of a panorama of the full sphere.  The image center is forward, and the image top is up."""
     return Lens(width, height, "EQUIRECTANGULAR", (width / math.tau, height / math.pi, width / 2, height / 2))
 
 

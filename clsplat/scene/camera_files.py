@@ -48,7 +48,10 @@ def with_image_names(scene: Scene) -> Scene:
 
 
 def image_files(views: Sequence[View], folder: Path) -> dict[Path, Path]:
-    """Return the photograph of each view by the path of its copy in `folder`.  Raises DataError if there is none."""
+    """Return a dictionary from the path of each photograph's copy in `folder` to the photograph.
+
+    Raises DataError if a view has no photograph, or only a part of a wide one.
+    """
     for view in views:
         if view.image_path == NO_FILE:
             raise DataError(f"the view {quote(view.name)} has no photo to copy; write only the cameras")
@@ -155,7 +158,7 @@ REMEDY = "use --format colmap, or run `clsplat data undistort` first"
 
 
 def write_nerfstudio(out: Path, scene: Scene) -> list[Path]:
-    """Write out/transforms.json and, if there are any, the points without their tracks; return the paths.
+    """Write out/transforms.json and the points (without their tracks), if there are any; return the paths.
 
     The test views are also listed as validation views, because nerfstudio evaluates those.  Raises OutputError.
     """

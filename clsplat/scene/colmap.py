@@ -196,7 +196,7 @@ class _BinaryFile:
         return f"{self.path}: byte {self.offset}"
 
     def skip(self, size: int, label: str) -> int:
-        """Skip `size` bytes and return the offset of the first byte.  label: their name in messages."""
+        """Skip `size` bytes and return the offset of the first byte.  label: the name of these bytes in messages."""
         available = len(self.data) - self.offset
         if size > available:
             raise DataError(
@@ -274,7 +274,7 @@ def read_points_binary(path: Path) -> PointTable:
 
 
 def find_file(folder: Path, stem: str) -> Path | None:
-    """Return `stem`.bin in a folder, otherwise `stem`.txt, or None."""
+    """Return the path of `stem`.bin in a folder, otherwise of `stem`.txt; None if neither exists."""
     files = (folder / f"{stem}.bin", folder / f"{stem}.txt")
     return next((file for file in files if file.is_file()), None)
 
@@ -376,7 +376,10 @@ def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
 
 
 def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
-    """Return the points that each image shows, with residuals for `views`, or None if no image lists points."""
+    """Return the points that each image shows, or None if no image lists points.
+
+    The reprojection residuals are included for images that have a view in `views`.
+    """
     is_finite = table.is_finite()
     positions, ids = table.positions[is_finite], table.ids[is_finite]
     order = np.argsort(ids, kind="stable")
@@ -464,7 +467,7 @@ def _make_lens(camera_id: int, camera: CameraRecord) -> Lens:
 
 
 def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> NDArray[np.float64]:
-    """Return the pose, [3, 4], of a quaternion (w, x, y, z) of any nonzero length and a translation, scene units.
+    """Return the pose, [3, 4], from a quaternion (w, x, y, z) of any nonzero length and a translation in scene units.
 
     Raises ValueError if values are missing or not finite, or if the quaternion is zero.
     """

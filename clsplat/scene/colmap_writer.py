@@ -70,7 +70,7 @@ def _project_points2d(points: PointCloud | None, view: View, tracks: Tracks | No
 
 
 def _pack_points(points: PointCloud, points2d: Sequence[NDArray[Any]]) -> list[bytes]:
-    """Return the record of each point; points2d: the 2D points of each image."""
+    """Return the binary record of each point, with its track.  points2d: the 2D points of each image."""
     tracks: list[bytes] = [b""] * len(points)
     for image_id, table in enumerate(points2d, 1):
         for index, point_id in enumerate(table["point"].tolist()):

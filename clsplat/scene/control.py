@@ -55,9 +55,10 @@ class MarkedPoint:
     coordinates: tuple[float, float, float] | None = None
 
     def locate(self, scene: Scene) -> tuple[Floats, list[LocatedMark]]:
-        """Return the position of the point in the coordinates of `scene`, [3], and the error of each mark.
+        """Return the position of the point in the coordinates of `scene`, [3], and each mark with its error.
 
-        Two or more marks are triangulated; one selects the nearest structure-from-motion point that its photo shows.
+        Two or more marks are triangulated.  A single mark selects the structure-from-motion point whose projection is
+        nearest to the mark, among the points that the photo shows.
         Raises DataError if the marks do not determine a position.
         """
         views = [find_view(scene, mark.photo) for mark in self.marks]
@@ -119,7 +120,7 @@ def _ray(view: View, pixel: Floats) -> tuple[Floats, Floats]:
 
 
 def _triangulate(views: Sequence[View], pixels: Floats, rays: Sequence[tuple[Floats, Floats]]) -> Floats:
-    """Return the position with the smallest squared reprojection errors, [3]; NaN if the rays are parallel."""
+    """Return the position, [3], with the smallest sum of squared reprojection errors; NaN if the rays are parallel."""
     planes = np.stack([np.eye(3) - np.outer(direction, direction) for _, direction in rays])
     centers = np.stack([center for center, _ in rays])
     if not np.linalg.cond(planes.sum(axis=0)) < 1e8:
@@ -144,10 +145,10 @@ MAX_CONTROL = 1 << 24  # bytes
 
 
 def read_control(path: Path) -> dict[str, MarkedPoint]:
-    """Read the points of a CSV file, one mark in a row: point, x, y, z, photo, u, v; other columns are ignored.
+    """Read the points of a CSV file, one mark per row: point, x, y, z, photo, u, v; other columns are ignored.
 
-    x, y, and z are the known coordinates, in one row of the point or in all; a point of a scale bar has none.
-    Raises DataError, with the line.
+    x, y, and z are the known coordinates of the point.  They may be empty in all but one row of a point, or in all rows
+    if only scale bars use the point.  Raises DataError, which names the line.
     """
     reader = csv.DictReader(read_text(path, "a CSV file of control points", limit=MAX_CONTROL).splitlines())
     points: dict[str, MarkedPoint] = {}
@@ -216,7 +217,7 @@ class ScaleBar:
         return cls(text, (first, second), length)
 
     def measure(self, scene: Scene | None) -> float:
-        """Return the distance between the ends in scene units.  Raises ConfigError, DataError."""
+        """Return the distance between the ends in scene units.  Raises ConfigError or DataError."""
         positions = []
         for end in self.ends:
             if not isinstance(end, MarkedPoint):
@@ -274,7 +275,7 @@ class GpsPositions:
 
 
 def to_utm(positions: Floats) -> tuple[Floats, int]:
-    """Convert latitude, longitude (degrees) and altitude (m), [N, 3], to UTM, in the zone of their median.
+    """Convert latitude, longitude (degrees) and altitude (m), [N, 3], to UTM, in the zone of their median longitude.
 
     Returns easting, northing, and altitude, [N, 3] m, and the EPSG code.  Krüger's series to the third order is exact
     to a millimeter.

@@ -76,7 +76,7 @@ def find_dataset(path: Path) -> Reader | None:
     """Return the reader of the dataset in a folder, or of the only dataset in its subfolders; None if there is none.
 
     If there are several models of the same photographs, the one with the image files is used, otherwise the largest
-    (in a tie, the first by name).  Raises DataError, with a list, for several datasets.
+    (in a tie, the first by name).  Raises DataError, which lists the datasets, if there are several.
     """
     datasets = find_datasets(path)
     if len(datasets) < 2:

@@ -136,7 +136,7 @@ class DecodedSizes:
             self._entries = dict(filter(None, map(_parse_entry, lines)))
 
     def get_size(self, digest: str, data: bytes, file: Path, upright: bool = False) -> Size:
-        """Return (width, height) of an image file, px, and decode `data` if it is not cached.  Raises DataError."""
+        """Return (width, height) of an image file, px; decode `data` if the size is not cached.  Raises DataError."""
         key = f"{digest}-upright" if upright else digest
         if key not in self._entries:
             pixels = decode_image(data, file, upright)
@@ -147,7 +147,7 @@ class DecodedSizes:
         return self._entries[key][:2]
 
     def flags(self, digest: str) -> tuple[bool, bool, bool]:
-        """Return three flags of a cached image: blank, excluding all pixels as a mask, and transparent."""
+        """Return whether a cached image is blank, excludes all pixels as a mask, and is transparent everywhere."""
         bits = self._entries[digest][2]
         return bool(bits & 1), bool(bits & 2), bool(bits & 4)
 

@@ -75,7 +75,7 @@ def _parse_jpeg_header(head: bytes, tail: bytes, read_all: Callable[[], bytes]) 
 def find_exif_segment(head: bytes) -> tuple[int, int] | None:
     """Return the offset and length of the EXIF segment in the first bytes of a JPEG file.
 
-    The TIFF block of the segment starts 10 bytes after the offset.  None if there is no such segment.
+    The TIFF block of the segment starts 10 bytes after the offset.  Returns None if there is no such segment.
     """
     matches = ((offset, length) for marker, offset, length in jpeg_segments(head) if _is_exif(head, marker, offset))
     return next(matches, None) if head.startswith(JPEG) else None
@@ -302,7 +302,8 @@ def read_exif_exposure(path: Path) -> CameraExposure | None:
 def read_exif_optics(path: Path) -> tuple[Value, ...] | None:
     """Return the make, model, focal length and 35 mm focal length in the EXIF data of a JPEG file.
 
-    A missing value is "".  Returns None without focal lengths.  Raises DataError when the file cannot be read.
+    A missing value is "".  Returns None if both focal lengths are missing.  Raises DataError when the file cannot be
+    read.
     """
     tags = _read_tags(path)
     values = [tags.get(tag, "") for tag in (MAKE, MODEL, FOCAL, FOCAL_35)]
@@ -324,7 +325,7 @@ def read_exif_camera(path: Path) -> tuple[str, bool]:
 def read_exif_position(path: Path) -> tuple[float, float, float] | None:
     """Return the GPS latitude and longitude (degrees) and altitude (m) in the EXIF data of a JPEG file.
 
-    Returns None unless it has all three, in their range.  Raises DataError when the file cannot be read.
+    Returns None if one of the three is missing or out of range.  Raises DataError when the file cannot be read.
     """
     tags = _read_tags(path)
     values = [tags.get(tag) for tag in (LATITUDE, LONGITUDE, ALTITUDE)]
@@ -336,7 +337,7 @@ def read_exif_position(path: Path) -> tuple[float, float, float] | None:
 
 
 def copy_exif(head: bytes, jpeg: bytes) -> bytes:
-    """Return the upright JPEG file `jpeg` with the EXIF data of another file, except for the rotation.
+    """Return the upright JPEG file `jpeg` with the EXIF data of another file, except for the other file's rotation.
 
     head: the first bytes of the other file.
     """
@@ -373,7 +374,8 @@ def _read_tags(path: Path) -> dict[int, Value]:
 def _read_ifd(block: bytes, order: str, start: int) -> dict[int, Value]:
     """Return the values of an image file directory (IFD) by tag.
 
-    The value of an array is its first element; three rationals are degrees, minutes, and seconds, in degrees.
+    Three rationals are degrees, minutes, and seconds; their value is in degrees.  The value of any other array is its
+    first element.
     """
     values: dict[int, Value] = {}
     (entry_count,) = struct.unpack_from(order + "H", block, start)

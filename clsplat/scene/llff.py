@@ -67,9 +67,10 @@ def read_poses(path: Path) -> NDArray[np.float64]:
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the image files in `images`, `input`, the largest `images_N` or `path` itself, sorted by name.
+    """Return the image files of a dataset, sorted by name.
 
-    The first of these folders that contains images is used; the list is empty if there is none.
+    They are in the first folder that contains images: `images`, `input`, `images_N` in ascending order of N, or `path`
+    itself.  The list is empty if there is no such folder.
     """
     small_folders = [folder for folder in path.glob("images_*") if re.fullmatch(r"images_\d+", folder.name)]
     for folder in (path / "images", path / "input", *sorted(small_folders, key=lambda f: int(f.name[7:])), path):

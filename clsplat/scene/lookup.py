@@ -80,7 +80,7 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
 
 
 def unsupported_cameras(path: Path) -> str:
-    """Return a sentence about an unsupported camera file of another program at or below `path`, or "" without one."""
+    """Return a sentence about an unsupported camera file of another program at or below `path`; "" if there is none."""
     folders = [(path.parent, [path.name])] if path.is_file() else walk_folders(path, 2)
     for folder, names in folders:
         for file in [folder / name for name in names if name.endswith((".json", ".xml", ".csv"))][:8]:
@@ -227,7 +227,7 @@ class FileLookup:
 
     @cached_property
     def hint(self) -> str:
-        """A remark in parentheses about similar files or the searched folders; "" if no file is missing."""
+        """A remark in parentheses that names similar files or the searched folders; "" if no file is missing."""
         if not self.skipped:
             return ""
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
@@ -255,7 +255,7 @@ def _stem(name: str) -> str:
 
 
 def _keys(parts: Parts) -> set[str]:
-    """Return the possible stems of a name's file, such as `a.jpg.png`, `a.jpg` and `a` for `a.jpg.png`."""
+    """Return the possible stems of the file for a name, such as `a.jpg.png`, `a.jpg` and `a` for `a.jpg.png`."""
     return {parts[-1], _stem(parts[-1]), _stem(_stem(parts[-1]))} if parts else set()
 
 

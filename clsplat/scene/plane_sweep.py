@@ -149,9 +149,9 @@ def _unproject(view: View, rows: Indices, columns: Indices, depth: Floats) -> Fl
 
 
 def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Indices, Indices, Floats]:
-    """Return which points, [M, 3], project into the image of a view, and the rows, columns and depths of all, [M].
+    """Return a mask, [M], of the points that project into the image of a view, and the rows, columns and depths of all.
 
-    Points behind the camera have depth 1.
+    points: [M, 3].  The depth of points behind the camera is 1.
     """
     camera, pose = view.camera, view.world_to_camera
     x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
@@ -166,7 +166,10 @@ def _project(view: View, points: Floats) -> tuple[NDArray[np.bool_], Indices, In
 def _confirm(
     i: int, views: Sequence[View], planes: Sequence[NDArray[np.int64]], neighbors: Sequence[int], inverse_depths: Floats
 ) -> NDArray[np.bool_]:
-    """Return a mask, [H, W], of the pixels whose depth enough adjacent views confirm, except on the outer planes."""
+    """Return a mask, [H, W], of the pixels whose depth enough adjacent views confirm.
+
+    Pixels on the nearest and on the farthest plane are not in the mask.
+    """
     shape = planes[i].shape
     rows, columns = (index.ravel() for index in np.indices(shape))
     points = _unproject(views[i], rows, columns, 1 / inverse_depths[planes[i].ravel()])

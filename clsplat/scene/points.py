@@ -37,15 +37,15 @@ class PointTable(NamedTuple):
     times: Floats = np.empty(0)  # [M] in the unit of the frame times, or [0]
 
     def is_finite(self) -> NDArray[np.bool_]:
-        """Return which points are finite, [M]."""
+        """Return a mask of the finite points, [M]."""
         is_finite = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
         return np.asarray(is_finite & (np.abs(self.times) < MAX_VALUE) if len(self.times) else is_finite)
 
     def cloud(self, clock: Clock | None = None) -> PointCloud:
         """Return the finite points, and log how many points are dropped.
 
-        clock: the clock of the frames.  Without it, the points have no times.  Raises DataError for times in another
-        unit.
+        clock: the clock of the frames; without a clock, the points have no times.  Raises DataError if the times of the
+        points are in a different unit from the frames' times.
         """
         is_finite, times = self.is_finite(), None
         if not is_finite.all():

@@ -70,7 +70,7 @@ class Reader(ABC):
     name: ClassVar[str]  # of the format
     expects: ClassVar[str]  # the file that marks the format, or a short description for custom `matches`
     missing: Missing = "refuse"  # what to do about missing photographs
-    root: Path | None = None  # folder of the scene, in which files are searched; None: the folder of the dataset
+    root: Path | None = None  # folder of the scene, in which files are looked up; None: the folder of the dataset
     folder: Path = Path()  # of the dataset, at or below `root`
     choice: str = ""  # why this dataset is used, if there are several; for `note`
     subclasses: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
@@ -88,7 +88,7 @@ class Reader(ABC):
 
     @property
     def note(self) -> str:
-        """One sentence that names the dataset that is read; "" for a dataset in the folder of the scene itself."""
+        """One sentence that names the dataset in use; "" unless the dataset is in a subfolder of the scene."""
         if self.root in (None, self.folder):
             return ""
         return f"the {self.name} dataset in {self.folder.relative_to(self.root).as_posix()} is used{self.choice}"

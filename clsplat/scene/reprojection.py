@@ -54,7 +54,7 @@ def replace_cameras(scene: Scene, views: Sequence[View]) -> Scene:
 def reprojection_errors(tracks: Tracks | None, views: Iterable[View]) -> Floats | None:
     """Return the mean reprojection error, px at the size of the view, of each point that `views` observe.
 
-    None if the errors are unknown, or if the observations were computed from the cameras.
+    Returns None if the errors are unknown, or if the observations were computed from the cameras.
     """
     if tracks is None or not tracks.residuals:
         return None

@@ -319,7 +319,7 @@ def have_same_center(centers: Floats) -> bool:
 def outlier_cameras(views: Sequence[View]) -> NDArray[np.bool_]:
     """Return a mask, [N], of the cameras farther than MAX_DISTANCE times the median distance from the median center.
 
-    If their fraction exceeds MAX_OUTLIERS, they are a separate group of cameras, and the mask is all False.
+    If their fraction exceeds MAX_OUTLIERS, they are assumed to be a separate group, and the mask is all False.
     """
     centers = np.stack([v.position for v in views])
     distance = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

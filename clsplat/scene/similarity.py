@@ -192,7 +192,7 @@ def level(
 ) -> Similarity:
     """Return the transform that rotates the unit vector `up`, [3], to -y, and scales around the point `anchor`, [3].
 
-    height: of the ground along `up`; the ground is moved to y = 0.
+    height: the height of the ground along `up`; the transform moves the ground to y = 0.
     """
     rotation, target = rotation_between(np.asarray(up, np.float64), UP), np.array(anchor, np.float64)
     if height is not None:

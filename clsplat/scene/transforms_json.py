@@ -78,7 +78,7 @@ class JsonFrame:
         return None if value is None else view_name(value)
 
     def image_name(self) -> str:
-        """Return the path of the image, as a view name.  Raises DataError when the frame has no path."""
+        """Return the path of the image, in the form of a view name.  Raises DataError when the frame has no path."""
         name = self.file_name("file_path")
         if name is None:
             raise DataError(
@@ -101,7 +101,7 @@ class Transforms:
         self.frames = [JsonFrame(path.parent, f"{path}: frames[{i}]", row, self.table) for i, row in enumerate(frames)]
 
     def timestamps(self) -> list[tuple[str, float | None]]:
-        """Return the source of every frame and its `time`, or None without one.  Raises DataError for invalid times."""
+        """Return the source and the `time` (None if missing) of every frame.  Raises DataError for invalid times."""
         return [(frame.source, frame.number("time")) for frame in self.frames]
 
     def points(self, clock: Clock | None = None) -> PointCloud | None:
@@ -119,7 +119,7 @@ class Transforms:
 
 
 class FrameFiles(FileLookup):
-    """The photographs and masks of the frames of a dataset in `folder`; the files are searched below `root`."""
+    """The photographs and masks of the frames of a dataset in `folder`; the files are looked up below `root`."""
 
     def __init__(self, root: Path, folder: Path, frames: Sequence[JsonFrame]) -> None:
         super().__init__(root, folder, [frame.image_name() for frame in frames], _with_png)
@@ -238,7 +238,7 @@ def _frame_camera(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
 
 
 def _read_focal(frame: JsonFrame, length_key: str, angle_key: str, pixels: int) -> float | None:
-    """Return a focal length in pixels, from its value or from the field of view of `pixels`; None without both."""
+    """Return a focal length in pixels, as given or from the field of view across `pixels`; None if both are missing."""
     length, angle = frame.number(length_key), frame.number(angle_key)
     degrees = frame.number(f"{angle_key[-1]}_fov")  # written by instant-ngp, in degrees
     if angle is None and degrees is not None:

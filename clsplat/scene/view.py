@@ -92,7 +92,7 @@ class View:
     ) -> "View":
         """Return a view from `position` toward `target`, with `up` pointing up in the image; each [3], in scene units.
 
-        Raises ValueError when the target equals the position or is in the direction of `up` from it.
+        Raises ValueError when the target equals the position, or when the viewing direction is parallel to `up`.
         """
         center, target_point, up_vector = (np.asarray(vector, np.float64) for vector in (position, target, up))
         if not center.shape == target_point.shape == up_vector.shape == (3,):
@@ -397,8 +397,8 @@ def zoom_lens(lens: Lens, factor: float) -> Lens:
 def photo_lens(view: View) -> Lens:
     """Return the lens of the photograph of a view as stored, or a pinhole lens if it has no distortion.
 
-    For a face of a wide photograph, it is the pinhole lens of the face.
-    Raises DataError when the focal length was optimized and the model of the lens does not support that.
+    For a face of a wide photograph, the result is the pinhole lens of the face.  Raises DataError when the focal length
+    was optimized and `zoom_lens` does not support the model of the lens.
     """
     c, lens = view.camera, view.lens
     if lens is None or lens.is_wide:

@@ -34,7 +34,7 @@ def _require_text(value: Any) -> Any:
 
 
 class MissingViewError(DataError):
-    """The error for a selection that does not match the photographs; it may match prepared photographs."""
+    """A selection does not match the photographs of the dataset.  It may match those after `prepare`."""
 
 
 class ViewSelection(Settings):
@@ -84,8 +84,9 @@ class ViewSelection(Settings):
     def select(self, names: Sequence[str], folders: Sequence[Path], excluded: ExcludedNames = NO_NAMES) -> set[int]:
         """Return the indices of the selected `names`.
 
-        folders: the folders in which a relative file is searched, in order.  excluded: names that must not be selected;
-        those with missing photographs are skipped.  Raises DataError for a listed name that matches no view or several.
+        folders: the folders in which a relative `file` is looked up, in order.  excluded: names that must not be
+        selected.  Listed names of missing photographs are skipped.  Raises DataError for a listed name that is
+        excluded, matches no view, or matches several.
         """
         if self.every is not None:
             return every_nth(names, self.every, self.offset)
@@ -163,7 +164,7 @@ class _NameIndex:
     def find_indices(self, name: str) -> list[int]:
         """Return the indices of the views whose names end with a listed name, with or without its suffix.
 
-        If there are none, names with another suffix match too, since prepared images are PNG files.
+        If no view matches, names with another suffix match too, since prepared images are PNG files.
         """
         return [i for match in self._find_matches(name) for i in self._views[self._names[match]]]
 
@@ -336,7 +337,9 @@ def _select(
     folders: Sequence[Path],
     excluded: ExcludedNames = NO_NAMES,
 ) -> set[int]:
-    """Return the indices of the selected names; a number n selects every n-th name from the first, and 0 selects none.
+    """Return the indices of the selected names.
+
+    A number n selects every n-th name in sorted order, starting with the first; 0 selects none.
 
     key: the name of the setting, for messages.
     """

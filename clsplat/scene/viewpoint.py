@@ -37,7 +37,9 @@ class Viewpoint:
 
     @classmethod
     def from_points(cls, points: NDArray[np.floating], views: Sequence[View], first: View | None) -> "Viewpoint":
-        """Return a viewpoint that starts at `first`.  Without `first` or views, it starts outside of most points.
+        """Return a viewpoint that starts at the view `first`.
+
+        If `first` is None or there are no views, it starts at a distance from which most points are visible.
 
         points: the centers of the splats, [N, 3].
         """
@@ -84,10 +86,11 @@ REFINEMENTS = 10
 
 
 def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
-    """Return the normal of the ground, [3], unit, and the height of the ground along it.
+    """Return the unit normal of the ground, [3], and the height of the ground along the normal.
 
-    It is the plane with the most points in it, minus the points below it, among planes that are tilted by at most 45
-    degrees from `up`, [3], unit.  points: [N, 3].  Raises DataError if few points are on a plane.
+    The ground is the plane with the largest score: the number of points in the plane minus the number of points below.
+    Only planes whose normal is within 45 degrees of the unit vector `up`, [3], are considered.  points: [N, 3].  Raises
+    DataError if few points are on such a plane.
     """
     rng = np.random.default_rng(0)
     points = points[np.isfinite(points).all(axis=1)].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Find the limits of a run's result from its views, records and cameras, and suggest a command for each limit."""
+"""Find what limits a model's quality, from the views, records and cameras of its run, and suggest commands."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -33,7 +33,7 @@ UNEVEN = 3.0  # times the median gap
 def collect_advice(run: Run, is_overfit: bool) -> list[str]:
     """Return at most MAX_LINES sentences of advice, the most important first, each with a command.
 
-    Empty if nothing stands out.  Renders at most MAX_MEASURED training views.
+    The list is empty if nothing stands out.  Renders at most MAX_MEASURED training views.
     """
     views = learned_scene(run).downscaled(run.downscale).split("train")
     sample = sample_views(views, MAX_MEASURED)
@@ -67,7 +67,7 @@ def advise_on_training_views(
     """Yield advice from the metrics of training views.
 
     has_exposures: whether training learns exposures.  rerun: the command that repeats the run.  steps: the number of
-    training steps, or None if moving objects cannot be masked.
+    training steps, or None if training cannot mask moving objects.
     """
     if names := find_outliers({view.view: view.psnr for view in metrics}):
         text = f"{_join_names(names)} {'disagrees' if len(names) == 1 else 'disagree'} with the other photos"
@@ -124,9 +124,9 @@ def find_outliers(psnr: Mapping[str, float]) -> list[str]:
 
 
 def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
-    """Return the widest gap between views around the point that they look at, in degrees, and the views next to it.
+    """Return the widest gap between views around the point that they look at, in degrees, and the two views next to it.
 
-    None if the views do not surround a point, if no gap stands out, or if the widest gap is an open side.
+    Returns None if the views do not surround a point, if no gap stands out, or if the widest gap is an open side.
     """
     if len(views) < 3:
         return None

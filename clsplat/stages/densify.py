@@ -46,7 +46,8 @@ class Densify(Scheduled):
 
     patience: Annotated[int, Field(gt=0)] | None = None
     """Number of consecutive measurements of the validation views without improvement after which growth ends; pruning
-    continues, and the patience of the training starts again.  Needs `keep: best`.  Default: growth does not end."""
+    continues, and the `patience` of the training counts from zero again.  Needs `keep: best`.  Default: growth does
+    not end."""
     grow_until: Annotated[int, Field(gt=0)] | None = None
     """Global step at which growth ends; pruning continues.  Default: growth does not end."""
 
@@ -101,7 +102,7 @@ class Densify(Scheduled):
             raise NumericError(f"step {run.step}: all Gaussians were pruned; weaken the prune rules or lower the rates")
 
     def _has_growth_ended(self, run: Run) -> bool:
-        """Return whether growth has ended, and record the step at which `patience` ends it in the run."""
+        """Return whether growth has ended.  If `patience` ends growth at this step, record the step in the run."""
         if self.grow_until is not None and run.step >= self.grow_until:
             return True
         best = run.best

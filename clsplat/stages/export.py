@@ -25,12 +25,12 @@ LOG = logging.getLogger("clsplat")
 
 
 class Export(Scheduled):
-    """Write the model in the format that the file name ends in, by default a PLY, and read it back.
+    """Write the model to a file, in the format that the file name's extension selects, and read the file back.
 
     A world filter is baked into scales and opacities, so that any viewer can show the file.  A second PLY, with `_raw`
-    in its name, contains the model as trained, with the filter as property `filter_3D`.  A learned sky is written as
-    distant Gaussians of the model; a file with `_without_sky` in its name contains the model without them, which
-    clsplat renders with the map of the sky, a file with `_sky.json` in its name.
+    in its name, contains the model as trained, with the filter as property `filter_3D`.  A learned sky is added
+    to the model as distant Gaussians.  Another file, with `_without_sky` in its name, contains the model without them;
+    clsplat renders it with the map of the sky, a file with `_sky.json` in its name.
     """
 
     stage: Literal["export"] = "export"
@@ -38,12 +38,12 @@ class Export(Scheduled):
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"file", "quality", "sky"}
 
     file: Annotated[str, path_in_run(*ENDINGS)] = "point_cloud.ply"
-    """Path inside the run folder; its ending selects the format: .ply, .spz, .sog, .glb, .splat, .usda."""
+    """Path inside the run folder; the extension selects the format: .ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Quality = "balanced"
     """Precision of harmonics, colors, positions and rotations in SPZ and SOG."""
     sky: Literal["splats", "sidecar"] = "splats"
-    """A learned sky (`model.background`): `splats`, 10,000 Gaussians on a distant sphere, which every viewer shows, or
-    `sidecar`, only a file next to the model, which clsplat reads."""
+    """Form of a learned sky (`model.background`): `splats`, 10,000 Gaussians on a distant sphere, which every viewer
+    shows; or `sidecar`, only a file next to the model, which no other viewer reads."""
 
     @model_validator(mode="after")
     def _check_quality(self) -> "Export":
@@ -122,7 +122,10 @@ class Cameras(Stage):
 
 
 class Checkpoint(Scheduled):
-    """Save a state from which a resumed run gives the same bits; also after the last step, so a run can be extended."""
+    """Save a state from which a resumed run gives the same bits.
+
+    A checkpoint is also saved after the last step, so that a run can be extended.
+    """
 
     stage: Literal["checkpoint"] = "checkpoint"
     needs: ClassVar[frozenset[str]] = frozenset({"painter"})
@@ -130,7 +133,7 @@ class Checkpoint(Scheduled):
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"keep", "every_seconds"}
 
     keep: Annotated[int, Field(gt=0)] = 2
-    """Number of checkpoints to keep, the newest ones."""
+    """Number of checkpoints to keep; older ones are removed."""
 
     every_seconds: Annotated[float, Field(gt=0)] | None = None
     """Seconds without a checkpoint after which another one is saved, in addition to `every`; this does not affect the

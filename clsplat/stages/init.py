@@ -102,25 +102,26 @@ class Init(Stage):
     edits: ClassVar[bool] = True
 
     source: Literal["auto", "points", "points+sweep", "sweep", "hull", "random", "model"] = "auto"
-    """Source of the first Gaussians."""
+    """Source of the initial Gaussians."""
     transparent: Literal["random", "hull"] = "random"
-    """Source of `auto` for a scene without points whose photos have transparent pixels."""
+    """Source that `auto` uses for a scene without points whose photos have transparent pixels."""
     min_points: Annotated[int, Field(ge=0)] = 0
     """Number of scene points below which `auto` adds points of a plane sweep."""
     opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1
-    """Opacity of the first Gaussians."""
+    """Opacity of the initial Gaussians."""
     scale: Annotated[float, Field(gt=0)] = 1.0
-    """Factor of the sizes of the first Gaussians."""
+    """Factor by which the sizes of the initial Gaussians are multiplied."""
     count: Annotated[int, Field(gt=0)] = 100_000
-    """Number of random points; largest number of points on a visual hull."""
+    """Number of random points, or maximum number of points on a visual hull."""
     sweep_points: Annotated[int, Field(gt=0)] = 20_000
-    """Largest number of points of a plane sweep."""
+    """Maximum number of points from a plane sweep."""
     times: Literal["uniform", "per_frame"] = "uniform"
     """Center in time of moving Gaussians: random, or the timestamp of the point's observation in the dataset.  With
     `per_frame`, points whose neighbors were observed at all times start static; others start with the spread of their
     neighbors' timestamps as duration, and with the velocity of the neighbors."""
     duration: Annotated[float, Field(gt=0)] = 4.0
-    """Standard deviation in time, as a fraction of the scene's duration; a long one starts with a static scene."""
+    """Initial standard deviation in time, as a fraction of the scene's duration; with a large value, the scene starts
+    static."""
     min_duration: Annotated[float, Field(gt=0)] = 0.1
     """Shortest duration of moving Gaussians with `times: per_frame`, as a fraction of the scene's duration."""
     file: InputPath | None = None

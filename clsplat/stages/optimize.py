@@ -46,8 +46,8 @@ class ValidatedTraining(Training):
     training_keys: ClassVar[frozenset[str]] = frozenset({"patience"})
 
     keep: Literal["last", "best"] = "last"
-    """Model to keep: the last one, or the one with the best PSNR at the validation views (the PSNR in the photos'
-    colors if all measured views have it)."""
+    """Model to keep: the last one, or the one with the best PSNR of the validation views.  If all measured
+    views have a `psnr_color`, that is used as the PSNR."""
     patience: Annotated[int, Field(gt=0)] | None = None
     """Number of measurements of the validation views without improvement after which the training ends; default: it
     does not end early."""
@@ -188,7 +188,10 @@ class ValidatedTraining(Training):
 
 
 def comparable_psnr(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
-    """Return the PSNR of averages in dB, or None: after color fitting if all views of all averages have this value."""
+    """Return the PSNR of each average in dB, or None if it was not measured.
+
+    The PSNR after color fitting is used if all averages have this value for all their views.
+    """
     has_color = all(
         average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in measured
     )
@@ -239,7 +242,7 @@ class Optimize(ValidatedTraining):
     training_keys: ClassVar[frozenset[str]] = frozenset({"rates", "update", "views_per_update"})
 
     rates: Rates = Rates()
-    """Learning rates."""
+    """Learning rates of the Gaussians' parameters."""
     update: Rows = "all"
     """Gaussians that a step updates: `all`; `seen`, where culled Gaussians keep their parameters and moments; or
     `deferred`, with the same bits as `all`, where `sh_rest` of culled Gaussians is updated when a view sees them."""

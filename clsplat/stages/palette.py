@@ -41,10 +41,10 @@ ROUNDS = 4  # iterations of Lloyd's algorithm; a fifth lowers the error of lego 
 class PaletteSh(Scheduled):
     """Replace the harmonics of each Gaussian with a vector of a palette, as SOG stores them.
 
-    Errors are weighted by their visibility in the training views: by the Gaussian's contribution, in the directions
-    from which it is seen, and after the base color has been adapted to absorb part of them.  Training with a rate of 0
-    for `sh_rest` then adapts the other tables, and the SOG stores the harmonics without loss.  Harmonics that already
-    form a palette keep it, rounded to the numbers that SOG can store.
+    The palette minimizes the errors that are visible in the training views: those in the directions from which the
+    Gaussian is seen, weighted by its contribution, after the base color has been adapted to absorb part of them.
+    Training with a rate of 0 for `sh_rest` then adapts the other tables, and the SOG stores the harmonics without loss.
+    Harmonics that already form a palette keep it, rounded to the numbers that SOG can store.
     """
 
     stage: Literal["palette_sh"] = "palette_sh"
@@ -54,9 +54,9 @@ class PaletteSh(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"quality", "step"})
 
     quality: Quality = "balanced"
-    """Quality of the SOG: `small`, `balanced` or `high`, with at most 1,024, 4,096 and 16,384 vectors."""
+    """Quality of the SOG: `small`, `balanced` or `high`, with at most 1,024, 4,096 or 16,384 vectors, respectively."""
     step: Annotated[float, Field(gt=0)] | None = None
-    """Step to which the coefficients are rounded, if at most 256 values result; larger steps make smaller files."""
+    """Step to which the coefficients are rounded if at most 256 values result; larger steps make smaller files."""
 
     def frozen_parameters(self, run: Run) -> Collection[str]:
         return "sh_base", "sh_rest"
@@ -78,11 +78,11 @@ class PaletteSh(Scheduled):
 
 
 class SharePalette(Scheduled):
-    """Move each vector of the palette to the mean of its Gaussians' harmonics, and assign it to them again.
+    """Set each vector of the palette, and the harmonics of its Gaussians, to the mean of these Gaussians' harmonics.
 
-    The mean is weighted by the contributions to the training views when `palette_sh` built the palette.  With a cadence
-    and a rate for `sh_rest`, this trains the vectors.  Run it right after that training too, since no edit follows the
-    last step.
+    The mean is weighted by the Gaussians' contributions to the training views at the time when `palette_sh` built the
+    palette.  With a cadence and a rate for `sh_rest`, this trains the vectors.  Also run the stage right after that
+    training, since no edit follows the last step.
     """
 
     stage: Literal["share_palette"] = "share_palette"
@@ -259,7 +259,7 @@ def set_clusters(gaussians: Gaussians, labels: NDArray[np.integer], weights: NDA
 
 
 def average_clusters(gaussians: Gaussians, name: str) -> None:
-    """Replace each row of a table with the weighted mean of its cluster's rows, summed in their order."""
+    """Replace each row of a table with the weighted mean of its cluster's rows, summed in row order."""
     labels = gaussians.get(LABEL)[:, 0].astype(np.int64)
     order, first = np.argsort(labels, kind="stable"), np.concatenate([[0], np.cumsum(np.bincount(labels))])
     gaussians.device.program("members.cl").share_mean(
@@ -294,7 +294,7 @@ class RoundTables(Stage):
     """Step of positions, as a fraction of the size of each Gaussian (the geometric mean of three standard deviations);
     larger for Gaussians of little weight."""
     quats: Levels | None = None
-    """Step of rotations, in levels of 255; axes are permuted so that each Gaussian turns as little as possible."""
+    """Step of rotations, in 8-bit levels; axes are permuted so that the rotation of each Gaussian is minimal."""
     log_scales: Step | None = None
     """Step of the logarithms of standard deviations."""
     sh_base: Step | None = None

@@ -50,7 +50,8 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 def score_gaussians(run: Run, score: Score = "weight") -> NDArray[np.float64]:
     """Return the score of each Gaussian, [N], summed over the pixels of the training views.
 
-    score: "weight" sums blend weights; the other scores sum squared derivatives of the image with respect to it.
+    score: "weight" sums blend weights; the other scores sum squared derivatives of the image with respect to each
+    Gaussian.
     """
     views = run.scene.split("train")
     renders = run.survey().render(run.status.counted(views, "views", len(views)))
@@ -117,7 +118,7 @@ class ReduceSh(Scheduled):
     degree: Annotated[int, Field(ge=0, le=MAX_DEGREE)] = MAX_DEGREE
     """Highest degree to keep, for all Gaussians."""
     share: Share = 0
-    """Fraction of all bands of all Gaussians to set to zero, the least important ones."""
+    """Fraction of all bands of all Gaussians to set to zero, starting with the least important bands."""
 
     def frozen_parameters(self, run: Run) -> Collection[str]:
         return ("sh_rest",)

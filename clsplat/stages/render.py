@@ -66,7 +66,7 @@ def image_path(folder: Path, view: str, suffix: str = ".png") -> Path:
 
 
 class Viewer(Stage):
-    """Write a page that shows the model from any viewpoint and next to its photos, and opens offline in any browser.
+    """Write a page that shows the model from any viewpoint, next to its photos; the page opens offline in any browser.
 
     If the page would exceed 200 MB, it shows only the most important Gaussians, with a warning.
     """
@@ -79,7 +79,7 @@ class Viewer(Stage):
     photographs: IncludedPhotos = "test"
     """Views whose photos are in the page; all views have a thumbnail."""
     photograph_budget: Annotated[float, Field(gt=0, le=MAX_SIZE)] = BUDGET
-    """MB of photos; with more, only every second, third, … is in the page."""
+    """Maximum total size of the photos in MB; if they are larger, only every second, third, … photo is in the page."""
 
     def run(self, run: Run) -> None:
         path, model = run.out / self.file, host_model(run)

@@ -29,7 +29,7 @@ class RaiseSh(Scheduled):
 class ResetOpacity(Scheduled):
     """Lower all opacities.  Training raises them where needed, and pruning removes floaters (Kerbl et al. 2023).
 
-    `value` applies after the world filter (Yu et al. 2024).
+    `value` limits the opacities after the world filter (Yu et al. 2024).
     """
 
     stage: Literal["reset_opacity"] = "reset_opacity"
@@ -40,7 +40,7 @@ class ResetOpacity(Scheduled):
     value: Annotated[float, Field(gt=0, lt=1)] = 0.01
     """Largest opacity after the reset."""
     when_background: Literal["black", "white"] | None = None
-    """Background with which the stage acts; default: any."""
+    """Background color for which the stage has an effect; default: any."""
 
     def frozen_parameters(self, run: Run) -> Collection[str]:
         return ("logit_opacity",) if self._is_active(run) else ()
@@ -59,7 +59,7 @@ class ResetOpacity(Scheduled):
 class RefreshFilter(Scheduled):
     """Update the world filter, and the sampling intervals that sizes in pixels depend on, to the current means.
 
-    `init` and every density edit update them too.  Without a filter and sizes in pixels, the stage has no effect.
+    `init` and every density edit update them too.  Without a filter or sizes in pixels, the stage has no effect.
     """
 
     stage: Literal["refresh_filter"] = "refresh_filter"

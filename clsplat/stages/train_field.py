@@ -29,7 +29,7 @@ class TrainField(Training):
 
     A step samples its rays from one photo, or the same number of rays from each of several photos.  With several image
     sizes, pixels are weighted by their area, so that all sizes contribute equally (section 4).  Stages that render,
-    measure and report support fields like Gaussians; `export_field` writes a file.
+    measure and report support fields as well as Gaussians; `export_field` writes a file.
     """
 
     stage: Literal["train_field"] = "train_field"
@@ -52,12 +52,12 @@ class TrainField(Training):
     rate: NonNegative = Decay(initial=5e-4, final=5e-6, over=1_000_000)
     """Learning rate."""
     warm_up: Annotated[int, Field(ge=0)] = 2500
-    """Steps in which the rate rises to `rate`, along a quarter of a sine."""
+    """Number of steps in which the learning rate rises to `rate`, along a quarter of a sine."""
     warm_up_from: Annotated[float, Field(ge=0, le=1)] = 0.01
-    """Fraction of the rate at the first step."""
+    """Fraction of `rate` with which the warm-up starts."""
     epsilon: Annotated[float, Field(gt=0)] = 1e-8
-    """Added to the square root of Adam's second moment; much smaller gradients, which are common in grids, have little
-    effect."""
+    """Term added to the square root of Adam's second moment.  Gradients that are much smaller, as is common in grids,
+    have little effect."""
     during: list[OneOf[Scheduled]] = Field([])
     """Stages that run at a cadence."""
     log_every: Annotated[int, Field(gt=0)] = 100
@@ -74,7 +74,7 @@ class TrainField(Training):
     def check_run(self, run: Run) -> None:
         """Check the run before the field is created.
 
-        Raises ConfigError if no camera shows the grid, MemoryLimitError if the field does not fit, and the errors of
+        Raises ConfigError if no camera sees the grid, MemoryLimitError if the field does not fit, and the errors of
         the stages in `during`.
         """
         super().check_run(run)

@@ -95,7 +95,7 @@ class Batch:
         """Prepare for the first cell.  This is called once, before that cell starts."""
 
     def on_change(self, started_cell: str | None) -> None:
-        """Handle the start or the end of a cell.  started_cell: its name, or None if a cell ended."""
+        """Handle the start or the end of a cell.  started_cell: its name; None: a cell has ended."""
 
     def require_lock(self) -> None:
         """Raise OutputError if another process has taken over the folder."""
@@ -197,7 +197,10 @@ class Batch:
 
 
 def ask_to_stop(stop: threading.Event, has_started: threading.Event) -> None:
-    """Let running cells save their state and stop.  Stop immediately before the first cell and at the second signal."""
+    """Let running cells save their state and stop.
+
+    The program stops at once if no cell has started yet, or if this is the second signal.
+    """
     if stop.is_set() or not has_started.is_set():
         stop_at_once()
     stop.set()

@@ -156,7 +156,7 @@ class CellRun:
         return json.dumps(asdict(self))
 
     def require_files(self) -> None:
-        """Raise DataError if an input file on this machine has another hash than the file used for the key."""
+        """Raise DataError if an input file on this machine has a different hash from the file used for the key."""
         for path, digest in self.files.items():
             if hash_content(Path(path)) != digest:
                 raise DataError(

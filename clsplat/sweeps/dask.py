@@ -217,7 +217,7 @@ class Cluster:
 
     @contextmanager
     def _requires_scheduler(self) -> Iterator[None]:
-        """Raise DeviceError if the block fails because the scheduler has ended."""
+        """Raise DeviceError if the block fails because the scheduler has exited."""
         try:
             yield
         except Exception as error:  # its type depends on when the scheduler ended
@@ -268,8 +268,8 @@ class Cluster:
 def offer_devices(execution: Execution, devices: Sequence[str] | None = None) -> None:
     """Test each device with a short run, and run cells of a scheduler until it exits or a signal arrives.
 
-    This is `clsplat worker`.  execution: has the address of the scheduler.  devices: names of devices; default: all
-    working devices.  Raises DeviceError if there is no device, or if the scheduler does not respond.
+    This is `clsplat worker`.  execution: contains the address of the scheduler.  devices: names of devices; default:
+    all working devices.  Raises DeviceError if there is no device, or if the scheduler does not respond.
     """
     if execution.tls:
         require_certificates(execution.tls)  # before the devices are tested, which takes a while
@@ -285,7 +285,7 @@ def offer_devices(execution: Execution, devices: Sequence[str] | None = None) ->
 
 
 def _constant_metric(text: str, worker: object) -> str:
-    """Return `text`, the description of a worker's device; Dask calls this as the function of a metric."""
+    """Return `text`, the description of a worker's device; Dask calls this function for a worker metric."""
     return text
 
 

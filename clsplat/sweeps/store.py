@@ -525,9 +525,9 @@ class Store:
         return folder
 
     def cancel(self, cell: str | None = None) -> str:
-        """Request that all running cells stop, or only one cell.  Return "all" or the key of the cell.
+        """Request that one running cell stop, or all running cells by default.  Return "all" or the key of the cell.
 
-        cell: its name or key.  Raises ConfigError if there is no such cell.
+        cell: the name or key of the cell; None: all cells.  Raises ConfigError if there is no such cell.
         """
         name = ALL if cell is None else self.find_key(cell)
         self.stop(name)
@@ -535,7 +535,7 @@ class Store:
         return name
 
     def stop(self, name: str) -> None:
-        """Request that all running cells with a key or sweep name stop, or all cells for the name "all"."""
+        """Request that running cells stop: those with this key or sweep name, or all cells if the name is "all"."""
         cancel_file = without_links(self.root, CANCEL, name)
         with raising_output_error(cancel_file):
             make_folder(cancel_file.parent)

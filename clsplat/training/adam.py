@@ -1,4 +1,4 @@
-"""Optimize the parameters of Gaussians with Adam, each with its learning rate, and average them over steps."""
+"""Optimize the parameters of Gaussians with Adam, with one learning rate per parameter, and average them over steps."""
 
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, ClassVar, Literal
@@ -264,7 +264,7 @@ def attach_gradients(gaussians: Gaussians) -> None:
 
 
 def add_gradients(gaussians: Gaussians, gradients: GaussianGradients) -> GaussianGradients:
-    """Add the gradients of a view to the mean, and return the mean, which the next call overwrites."""
+    """Include the gradients of a view in the mean over views, and return the mean, which the next call overwrites."""
     _add_to_mean(gaussians, {name: gradients[name] for name in gaussians.trained}, GRADIENT, VIEWS)
     return gradients.replace({name: gaussians[GRADIENT + name] for name in gaussians.trained})
 
@@ -313,7 +313,7 @@ def _add_to_mean(gaussians: Gaussians, values: Mapping[str, Array], prefix: str,
 
 
 def apply_average(gaussians: Gaussians) -> None:
-    """Replace parameters with their averages in all rows that have one, and remove the tables of averages."""
+    """Replace parameters with their averages in all rows that have an average, and remove the tables of averages."""
     program = gaussians.device.program("average.cl")
     for name in gaussians.trained:
         program.take_average(

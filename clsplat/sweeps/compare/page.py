@@ -211,9 +211,9 @@ MAX_LINES = len(COLORS)  # of a chart; if there are more runs, each line is the 
 
 
 def curves(rows: Sequence[VariantRow]) -> list[Markup]:
-    """Draw charts of PSNR and Gaussians over steps, and of metrics over image sizes, as SVG.
+    """Draw charts of PSNR and the number of Gaussians during training, and of metrics over image sizes, as SVG.
 
-    Charts over steps have a line per run, or per variant if there are more than MAX_LINES runs.
+    Charts of the training have a line per run, or per variant if there are more than MAX_LINES runs.
     """
     downscale = rows[0].runs[0].scene.downscale
     shows_means = sum(len(row.runs) for row in rows) > MAX_LINES
