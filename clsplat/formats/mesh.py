@@ -21,14 +21,14 @@ ROWS = 4096  # of text, formatted at once
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles, counterclockwise from outside."""
+    """A triangle mesh; the corners of a face are counterclockwise, seen from outside."""
 
     vertices: Floats  # [V, 3] scene units
     faces: NDArray[np.int64]  # [F, 3]
     colors: NDArray[np.uint8]  # [V, 3] sRGB
 
     def normals(self) -> Floats:
-        """Return the unit normals of the vertices, [V, 3], averages over their faces by area."""
+        """Return the unit normals of the vertices, [V, 3]: area-weighted means of the normals of their faces."""
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         by_area, corners, count = np.cross(b - a, c - a), self.faces.ravel(), len(self.vertices)
         total = np.stack([np.bincount(corners, np.repeat(by_area[:, k], 3), count) for k in range(3)], axis=1)
@@ -36,7 +36,7 @@ class Mesh:
         return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
 
     def edge_counts(self) -> NDArray[np.int64]:
-        """Return the number of faces at each edge, [E]: 2 inside a surface, 1 on its border, more if not manifold."""
+        """Return the number of faces at each edge, [E]: 2 inside a surface, 1 on its border, more if non-manifold."""
         edges = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         return np.asarray(np.unique(edges[:, 0] * len(self.vertices) + edges[:, 1], return_counts=True)[1])
 
@@ -46,13 +46,13 @@ class Mesh:
         return bool((self.edge_counts() == 2).all())
 
     def select(self, is_kept: NDArray[np.bool_]) -> "Mesh":
-        """Return the mesh with only these faces, [F], and the vertices that they use."""
+        """Return the mesh with only the faces of a mask, [F], and the vertices of these faces."""
         used, faces = np.unique(self.faces[is_kept], return_inverse=True)
         return Mesh(self.vertices[used], faces.reshape(-1, 3), self.colors[used])
 
 
 def write_ply(path: Path, mesh: Mesh, origin: Floats) -> None:
-    """Write a binary PLY file; coordinates are double if the scene has an origin.  Raises OutputError."""
+    """Write a binary PLY file, with float64 coordinates if the scene has an origin.  Raises OutputError."""
     kind, code = ("double", "<f8") if origin.any() else ("float", "<f4")
     names = [*((f"{kind} {name}", code) for name in "xyz"), *((f"float n{name}", "<f4") for name in "xyz")]
     names += [(f"uchar {name}", "u1") for name in ("red", "green", "blue")]
@@ -86,7 +86,7 @@ def write_obj(path: Path, mesh: Mesh, origin: Floats) -> None:
 
 
 def write_glb(path: Path, mesh: Mesh, origin: Floats) -> None:
-    """Write a GLB file: y up, vertex colors in 16 bits, the origin as the translation of its node.
+    """Write a GLB file: y is up, vertex colors have 16 bits, and the origin is the translation of the mesh's node.
 
     Raises OutputError.
     """

@@ -1,4 +1,4 @@
-"""Encode values for compact formats: smallest-three quaternions, Morton order, WebP images, hashed output."""
+"""Encode values for compact formats (smallest-three quaternions, Morton order, WebP images), and write hashed files."""
 
 import hashlib
 import logging
@@ -22,9 +22,9 @@ _SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00
 
 
 def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the index of each unit quaternion's largest component, [N], and its other three, in order, [N, 3].
+    """Return the index of each unit quaternion's largest component, [N], and its other three components, [N, 3].
 
-    Signs are chosen so that the largest is positive.
+    The largest component has the largest magnitude; a quaternion is negated if this component is negative.
     """
     largest_index = np.argmax(np.abs(quats), axis=1)
     rows = np.arange(len(quats))
@@ -55,19 +55,19 @@ def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
 
 
 def _spread(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Insert two zero bits before each of 21 bits."""
+    """Insert two zero bits before each of the lowest 21 bits."""
     for shift, mask in (*_SPREAD, (2, 0x1249249249249249)):
         values = (values | (values << np.uint64(shift))) & np.uint64(mask)
     return values
 
 
 def exceeds_byte(levels: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask, with the shape of `levels`, of the levels that do not round to a value of a byte."""
+    """Return a mask, with the shape of `levels`, of the levels that do not round to a number from 0 to 255."""
     return (levels < -0.5) | (levels > 255.5)
 
 
 def warn_clipped(path: Path, name: str, ranges: str, is_clipped: NDArray[np.bool_]) -> None:
-    """Warn about Gaussians with values outside a format's range.  is_clipped: mask of the values, [N, K]."""
+    """Warn about Gaussians with values outside a format's range.  is_clipped: mask of such values, [N, K]."""
     if count := int(is_clipped.any(axis=1).sum()):
         LOG.warning("%s: %s stores %s; values of %s Gaussians were clipped", path, name, ranges, f"{count:,}")
 
@@ -96,9 +96,9 @@ def encode_webp(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
 
 
 def decode_webp(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int) -> NDArray[np.uint8]:
-    """Decode the pixels of an image, [n, 4] RGBA, row by row, with `min_pixels` <= n <= `max_pixels`.
+    """Decode a WebP image to pixels, [n, 4] RGBA, row by row.
 
-    Raises DataError for another format, and, before decoding, for another size.
+    Raises DataError for another format, and, before decoding, if n is below `min_pixels` or above `max_pixels`.
     """
     width, height = webp_size(path, name, data)
     if not min_pixels <= width * height <= max_pixels:
@@ -116,7 +116,7 @@ def decode_webp(path: Path, name: str, data: bytes, min_pixels: int, max_pixels:
 
 
 def _decode_rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Decode pixels, [n, 4].  An image without an alpha channel gets an alpha of 255."""
+    """Decode an image to pixels, [n, 4] RGBA.  Without an alpha channel, alpha is 255; for a damaged image, n is 0."""
     image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype != np.uint8 or image.ndim != 3:
         return np.zeros((0, 4), np.uint8)
@@ -126,7 +126,7 @@ def _decode_rgba(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def webp_size(path: Path, name: str, data: bytes) -> tuple[int, int]:
-    """Return the width and height, px, from the header of an image.  Raises DataError for another format."""
+    """Return the width and height, px, in the header of a lossless WebP image.  Raises DataError for other data."""
     chunk_type = data[12:16]
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) >= 30:
         if chunk_type == b"VP8L":

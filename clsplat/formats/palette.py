@@ -1,7 +1,7 @@
 """Compute codebooks of scalars and palettes of vectors, bit-identical on all machines and for any number of threads.
 
-Order-dependent sums run in a fixed order.  Matrix products, whose order of summation the library chooses, only multiply
-integers whose products and sums are exact in float32.
+Order-dependent sums run in a fixed order.  The BLAS library chooses the order in which matrix products are summed, so
+their factors are integers whose products and sums are exact in float32.
 """
 
 import numpy as np
@@ -19,8 +19,9 @@ def fit_codebook(values: NDArray[np.floating], step: float | None = None) -> NDA
     """Return a codebook, [ENTRIES] in ascending order, that approximates `values` with a small squared error.
 
     If there are at most ENTRIES distinct values, these are returned exactly, and the last one is repeated.  Otherwise,
-    the same is tried for `values` rounded to multiples of `step`.  If that fails, too, rounds of Lloyd's iteration
-    (1982) compute the codebook.  Between rounds, two cells are merged if this costs less than splitting another gains.
+    the same is tried for `values` rounded to multiples of `step`.  If these also have too many distinct values,
+    rounds of Lloyd's iteration (1982) compute the codebook.  Between rounds, two cells are merged if this costs less
+    than splitting another gains.
     """
     sorted_values = np.sort(values.astype(np.float64) + 0.0, axis=None)  # makes -0 equal to 0, whose order is undefined
     for candidates in [sorted_values] + ([np.rint(sorted_values / step) * step] if step else []):
@@ -52,7 +53,7 @@ class _Cells:
         return np.where(last > first, mean, self.sorted_values[np.maximum(first, 1) - 1])
 
     def errors(self, first: NDArray[np.int64], last: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the squared error of each cell, from index `first` up to, but not including, `last`."""
+        """Return the squared error of each cell, which contains the values from index `first` to `last` - 1."""
         total = self.sums[last] - self.sums[first]
         return np.asarray(self.squares[last] - self.squares[first] - np.square(total) / np.maximum(last - first, 1))
 
@@ -101,8 +102,8 @@ def fit_palette(
     """Return at most `entry_count` vectors, [E, c], that approximate points [N, c], and the label of each point, [N].
 
     If there are at most `entry_count` distinct points, these are returned exactly.  Otherwise, Lloyd's iteration runs
-    on a sample of the points, and starts from evenly spaced ones.  A vector without points moves to the point with the
-    largest error.  Points have at most 45 components.  weights: relative probabilities of sampling each point, [N].
+    on a sample of the points, and starts from evenly spaced rows.  A vector without points moves to the point with
+    the largest error.  Points have at most 45 components.  weights: relative probabilities of sampling each point, [N].
     """
     if (exact_palette := unique_points(points, entry_count)) is not None:
         return exact_palette
@@ -128,7 +129,7 @@ def fit_palette(
 def _nearest_vectors(
     points: NDArray[np.float32], vectors: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the index of the vector, [E, c], nearest to each point, [N, c], and half their squared distance, both [N].
+    """Return the index of the vector, [E, c], nearest to each point, [N, c], and half its squared distance, both [N].
 
     The first vector wins ties.  Points and vectors are integers from -LEVELS to LEVELS, so all results are exact.
     """
@@ -164,7 +165,7 @@ def _to_integers(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
-    """Return the distinct points in order of appearance and the label of each point; None if more than `max_points`."""
+    """Return the distinct points in order of appearance, and each point's label; None for more than `max_points`."""
     if len(np.unique(points[:, 0])) > max_points:  # a fast test that suffices for most models
         return None
     unique_rows, first_rows, labels = np.unique(points, axis=0, return_index=True, return_inverse=True)

@@ -95,7 +95,7 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
     """Parse the header of a PLY file from at least its first MAX_HEADER bytes; `path` is for messages.
 
     Elements before the vertices must not have lists; elements after them may.
-    Raises DataError if it is not a PLY file, has no vertices, or has vertices with lists.
+    Raises DataError if the file is not a PLY file, has no vertices, or has vertices with lists.
     """
     end = END.search(data, 0, MAX_HEADER)
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
@@ -132,7 +132,7 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
 
 
 def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
-    """Return the vertices of an ascii file, one per line, as a structured array, [count].  Raises DataError."""
+    """Return the vertices of an ASCII file, one per line, as a structured array, [count].  Raises DataError."""
     body = io.BytesIO(data[header.start :])
     for _ in range(header.lines_before):
         if not body.readline():
@@ -193,7 +193,7 @@ def _header(path: Path, encoding: str, comments: tuple[str, ...], elements: list
 
 
 def _list_sections(elements: list[_Element], order: str, start: int) -> dict[str, Section]:
-    """Return the sections of a binary file by name, up to an element with a list.  The first of equal names counts."""
+    """Return a binary file's sections before the first list, by name; if a name is repeated, the first such section."""
     sections: dict[str, Section] = {}
     for element in elements:
         if element.has_list:
@@ -227,7 +227,7 @@ _COLUMNS = {
 def read_ply(path: Path) -> SplatFile:
     """Read a splat PLY.  The discs of 2DGS, which have no scale_2, get a third log scale of at most FLAT_LOG_SCALE.
 
-    Raises DataError if it is missing, damaged, or not a splat PLY.
+    Raises DataError if the file is missing, damaged, or not a splat PLY.
     """
     with open_file(path, "a PLY file") as file:
         header = parse_ply_header(path, file.read(MAX_HEADER))
@@ -248,7 +248,7 @@ def read_ply(path: Path) -> SplatFile:
 def write_ply(path: Path, parameters: Parameters, rendering: dict[str, Any]) -> str:
     """Write parameters in the property order of 3DGS, and filter_variance if present; return the file's SHA-256.
 
-    `rendering` becomes a JSON comment; with `compensate`, the mode is mip.  Raises OutputError.
+    `rendering` becomes a JSON comment; if its `compensate` is true, the mode is mip.  Raises OutputError.
     """
     count = len(parameters["means"])
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -407,7 +407,7 @@ def join_plys(path: Path, parts: Sequence[Path], check: Check) -> int:
     """Write the vertices of all parts in order, with the header of the first part; return the number of vertices.
 
     check: called with the index of a part and the means of some of its rows, [n, 3]; it may raise an error.
-    Raises DataError if a part is damaged or its properties or comments differ from the first, and OutputError.
+    Raises DataError if a part is damaged, or differs from the first in properties or comments, and OutputError.
     """
     headers = [_read_header(part) for part in parts]
     first, count = headers[0], sum(header.count for header in headers)

@@ -157,7 +157,7 @@ def looks_like_sog(data: bytes) -> bool:
 
 
 def read_sog(path: Path) -> SplatFile:
-    """Read a `.sog` file, or a folder from its meta.json.  Raises DataError if a file is missing or damaged."""
+    """Read a `.sog` file, or a SOG folder, given its meta.json.  Raises DataError if a file is missing or damaged."""
     with sog_files(path) as files:
         try:
             meta = json.loads(files.read(META))
@@ -167,7 +167,7 @@ def read_sog(path: Path) -> SplatFile:
 
 
 def require_plausible(path: Path, count: int, size: int, degree: int = 0) -> None:
-    """Raise DataError if `size` bytes cannot contain `count` splats, MemoryLimitError if the memory is too small."""
+    """Raise DataError if `size` bytes cannot contain `count` splats, MemoryLimitError if memory is too small."""
     if count > MIN_LIMIT + PIXELS_PER_BYTE * size:
         raise DataError(f"{path}: declares {count} splats, but its files have only {size} bytes; copy it again")
     require_memory(path, count, degree)
@@ -435,8 +435,9 @@ class Harmonics:
     ) -> "Harmonics":
         """Fit a small palette to SH coefficients, [N, c].  Training with its `values` makes saving lossless.
 
-        weights: of the squared errors, [N].  refine: returns a better palette, [E, c], and the label of each splat.
-        step: multiple to which codebook values are rounded if at most 256 of them remain.
+        weights: weight of each splat's squared error, [N].  refine: receives palette vectors, [E, c], and returns
+        better ones and the label of each splat.  step: codebook values are rounded to multiples of this if at most 256
+        distinct values remain.
         """
         vectors, labels = fit_palette(rest, _training_entries(len(rest), quality), weights)
         if weights.any() and not np.array_equal(vectors[labels].astype(np.float32), rest):
@@ -465,7 +466,7 @@ def _training_entries(count: int, quality: Quality) -> int:
 def _quantize(
     p: Parameters, weights: NDArray[np.float64], options: WriteOptions
 ) -> tuple[Parameters, Harmonics | None]:
-    """Round the tables; return them and a palette of the SH, or None if there are no SH bands above 0.
+    """Round the tables; return them, and a palette of the SH (None if there are no SH bands above 0).
 
     If the SH already form a palette, training has rounded all tables, and they stay unchanged.
     Quality `high` rounds tables only to the precision of the format.

@@ -33,9 +33,10 @@ def round_to(values: Floats, step: float) -> NDArray[np.float32]:
 def round_means(
     means: Floats, log_scales: Floats, log_weights: NDArray[np.float64], fraction: float
 ) -> NDArray[np.float32]:
-    """Round positions, [N, 3], with a step for each Gaussian, about `fraction` of its size if its weight is the median.
+    """Round positions, [N, 3], to multiples of a step for each Gaussian.
 
-    The step is proportional to 1 / sqrt(weight), rounded to a power-of-two number of SOG levels.
+    The step is about `fraction` of the size for a Gaussian of median weight, and proportional to size / sqrt(weight).
+    It is rounded to a power-of-two number of SOG levels.
     """
     levels, low, level = _to_levels(means)
     sizes = np.maximum(_sizes(means, log_scales) / level, TINY)
@@ -45,7 +46,7 @@ def round_means(
 
 
 def _to_levels(means: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Quantize positions: return levels, [N, 3], and for each axis the smallest logarithm and the level's size, [3]."""
+    """Quantize positions: return levels, [N, 3], and the smallest logarithm and the level size of each axis, [3]."""
     positions = means.astype(np.float64)
     logarithms = np.sign(positions) * np.log1p(np.abs(positions))
     low, span = logarithms.min(axis=0), np.ptp(logarithms, axis=0)
@@ -101,7 +102,7 @@ def quantization_steps(log_weights: NDArray[np.float64], median: float, max_step
 
 
 def scaled_step(rest: Floats, step: float, max_step: float) -> float:
-    """Convert a step for SH with an RMS of TYPICAL_RMS to a step, at most `max_step`, for the RMS of `rest`."""
+    """Scale `step`, which suits SH with an RMS of TYPICAL_RMS, to the RMS of `rest`; return at most `max_step`."""
     size = float(np.sqrt(np.square(np.clip(rest, -1, 1), dtype=np.float64).mean())) if rest.size else 0.0
     return min(max_step, step * max(size / TYPICAL_RMS, 1e-3))
 
@@ -283,7 +284,7 @@ def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
 
 
 def is_before_gap(distances: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask, [N], of the distances below the gap that separates a sky.  Without a gap, all are below."""
+    """Return a mask, [N], of the distances below the gap that separates a sky, or of all distances without a gap."""
     sorted_distances, count = np.sort(distances), len(distances)
     counts = np.arange(1, count + 1)
     near_counts = np.searchsorted(sorted_distances, sorted_distances / GAP, side="right")

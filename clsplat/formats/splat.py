@@ -44,7 +44,7 @@ EXPECTED = "a .splat file with 32 bytes per splat"
 
 
 def looks_like_splat(data: bytes, size: int) -> bool:
-    """Return whether a file of `size` bytes may contain splats, given its first bytes; it has no magic number."""
+    """Return whether a file of `size` bytes that starts with `data` may be a `.splat`, which has no magic number."""
     count = len(data) // ROW.itemsize
     if not count or size % ROW.itemsize or data.isascii():
         return False
@@ -56,7 +56,7 @@ def looks_like_splat(data: bytes, size: int) -> bool:
 
 
 def read_splat(path: Path) -> SplatFile:
-    """Read a `.splat` file.  Raises DataError if it is missing or has another size."""
+    """Read a `.splat` file.  Raises DataError if it is missing, or its size is not a multiple of 32 bytes."""
     data = read_file(path, EXPECTED, limit=MAX_FILE)
     if len(data) % ROW.itemsize:
         raise DataError(f"{path}: has {len(data)} bytes, not a multiple of 32; expected {EXPECTED}; copy it again")
@@ -145,7 +145,7 @@ class SplatSection:
 
 
 def looks_like_ksplat(data: bytes, size: int) -> bool:
-    """Return whether a file of `size` bytes may start with a header, given its first bytes; it has no magic number."""
+    """Return whether a file of `size` bytes that starts with `data` may be a `.ksplat`, which has no magic number."""
     if size < HEADER + SECTION or len(data) < HEADER or data[0] != 0 or not 1 <= data[1] < 32:
         return False
     max_sections, sections, _, splats, level = struct.unpack_from("<4IH", data, 4)

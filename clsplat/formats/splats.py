@@ -40,7 +40,7 @@ def is_timestamp(time: float) -> bool:
 
 
 def motion_width(degree: int, has_turn: bool) -> int:
-    """Return the number of columns of a motion table.  degree: of its polynomials, 1 to 3; has_turn: has rotations."""
+    """Return the number of columns of a motion table.  degree: 1 to 3, of the polynomials; has_turn: with rotations."""
     return 2 + 3 * degree + TURN * has_turn
 
 
@@ -53,7 +53,7 @@ def motion_degree(width: int) -> int:
 
 
 def motion_fields(width: int) -> dict[str, slice]:
-    """Return the column slice of each field, by name and in order, of a motion table with `width` columns."""
+    """Return the column slices of the fields of a motion table with `width` columns, by field name, in order."""
     degree, has_turn = WIDTHS[width]
     names = ["velocity", "time_center", "log_duration", *("acceleration", "jerk")[: degree - 1], *["turn"] * has_turn]
     ends = accumulate(FIELDS[name] for name in names)
@@ -177,7 +177,7 @@ def logits(alpha: Floats) -> NDArray[np.float32]:
 
 
 def opacities(logit: Floats) -> NDArray[np.float64]:
-    """Convert logits to opacities in [0, 1], exact to 1e-16."""
+    """Convert logits to opacities in [0, 1], accurate to 1e-16."""
     return np.asarray(0.5 + 0.5 * np.tanh(0.5 * logit.astype(np.float64)))
 
 
@@ -254,7 +254,7 @@ def not_finite(parameters: Parameters) -> NDArray[np.bool_]:
 
 
 def typical_size(means: NDArray[np.floating]) -> float:
-    """Return the median distance of means, [N, 3], from their center, or the largest if that is 0, scene units."""
+    """Return the median distance of means, [N, 3], from their center, scene units; if it is 0, the largest distance."""
     valid = means[np.isfinite(means).all(axis=1)].astype(np.float64)
     distances = np.linalg.norm(valid - np.median(valid, axis=0), axis=1) if len(valid) else np.zeros(1)
     return float(np.median(distances)) or float(distances.max()) or 1.0
@@ -300,7 +300,7 @@ def clamp_limits(path: Path, splats: SplatFile, options: ReadOptions) -> SplatFi
 
 
 def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return the logarithms of scales.  If most are negative, assume that they are logarithms, and add to `notes`."""
+    """Return the logarithms of scales.  If most are negative, assume that they are logarithms, and add a note."""
     if np.count_nonzero(scales < 0) > MIN_OUTSIDE * scales.size:
         notes.add("its scales are negative: they are read as logarithms")
         return scales.astype(np.float32)
@@ -308,7 +308,7 @@ def scales_to_logs(scales: Floats, notes: set[str]) -> NDArray[np.float32]:
 
 
 def opacities_to_logits(alpha: Floats, notes: set[str]) -> NDArray[np.float32]:
-    """Return the logits of opacities.  If most are outside [0, 1], assume that they are logits, and add to `notes`."""
+    """Return the logits of opacities.  If most are outside [0, 1], assume that they are logits, and add a note."""
     if np.count_nonzero((alpha < 0) | (alpha > 1)) > MIN_OUTSIDE * alpha.size:
         notes.add("its opacities are outside of 0 to 1: they are read as logits")
         return alpha.astype(np.float32)

@@ -121,7 +121,7 @@ class SpzHeader:
 
 
 def unpack_planes(header: SpzHeader, planes: Sequence[Callable[[int], bytes]]) -> Parameters:
-    """Decode the planes of a file.  planes: functions that return the next bytes of each plane, given their number."""
+    """Decode the planes of a file.  planes: a function per plane, which takes n and returns the next n bytes."""
     byte = np.arange(256, dtype=np.float32)
     levels = {
         "logit_opacity": logits(np.arange(256) / 255.0),
@@ -169,7 +169,7 @@ def _unpack_4_byte_quats(packed: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) -> int:
-    """Return the number of fractional bits with which all positions fit into 24 bits, and warn if it is small.
+    """Return the largest useful number of fractional bits with which positions fit into 24 bits; warn if it is small.
 
     Raises DataError if positions do not fit even without fractional bits.
     """
@@ -217,7 +217,7 @@ def pack_planes(
 
 
 def _encode_positions(p: Parameters, weights: NDArray[np.float64], fraction: int, relative: float) -> bytes:
-    """Encode coordinates in 24 bits, rounded to power-of-two steps of about `relative` times the smallest scale.
+    """Encode coordinates in 24 bits, rounded to power-of-two steps of `relative` times a Gaussian's smallest scale.
 
     Gaussians of small weight have larger steps.
     """
@@ -335,7 +335,7 @@ def read_spz(path: Path, options: ReadOptions) -> SplatFile:
 
 
 def decode_spz(path: Path, data: bytes) -> tuple[SplatFile, str]:
-    """Decode an SPZ file; return the splats and the declared axes, or ''.  Raises the errors of `read_spz`."""
+    """Decode an SPZ file; return the splats and the declared axes ('' if none).  Raises the errors of `read_spz`."""
     is_version_4 = data[:4] == MAGIC and SpzHeader.parse(path, data).version == 4
     header, parameters, axes = (_decode_version_4 if is_version_4 else _decode_gzip)(path, data)
     warn_dropped(path, header.degree)
@@ -405,7 +405,7 @@ class _GzipReader:
         self.path, self.data, self.file, self.stream = path, data, io.BytesIO(data), zlib.decompressobj(31)
 
     def read(self, size: int) -> bytes:
-        """Return the next `size` decompressed bytes, or less at the end of the content."""
+        """Return the next `size` decompressed bytes, or fewer at the end of the content."""
         data = bytearray()
         while len(data) < size and (not self.stream.eof or self._start_member()):
             packed = self.stream.unconsumed_tail or self.file.read(BLOCK)
@@ -472,7 +472,7 @@ def _max_decoded_size(data: bytes) -> int:
 
 
 def _check_size(path: Path, header: SpzHeader, limit: int) -> None:
-    """Raise DataError if the declared splats have more than `limit` bytes, MemoryLimitError if memory is too small."""
+    """Raise DataError if the declared splats take more than `limit` bytes, MemoryLimitError if memory is too small."""
     if (total := sum(header.sizes)) > limit:
         raise DataError(
             f"{path}: declares {header.count} splats of {total} bytes, more than it can contain ({limit}); "
@@ -482,7 +482,7 @@ def _check_size(path: Path, header: SpzHeader, limit: int) -> None:
 
 
 def _read_axes(path: Path, read: Callable[[int], bytes]) -> str:
-    """Return the declared axes, or ''.  Other extensions are skipped, as in Niantic's library.  Raises DataError."""
+    """Return the declared axes ('' if none).  Skips other extensions, as Niantic's library does.  Raises DataError."""
     axes = ""
     while len(record := read(8)) == 8:
         record_type, length = struct.unpack("<2I", record)

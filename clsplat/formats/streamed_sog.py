@@ -1,7 +1,7 @@
 """Read and write streamed SOG of PlayCanvas, version 1: levels of detail in SOG files, and a tree of boxes.
 
     lod-meta.json   version 1, count of all levels, counts by level, lodLevels, filenames, tree, and an environment
-    a node          bound {min, max}, and two children; a leaf has lods: a file, an offset and a count by level
+    a node          bound {min, max}, and two children; a leaf has lods: file, offset, and count for each level
     L_i/meta.json   a SOG folder of level L, with the splats of one leaf after another; level 0 is the finest
 
 A viewer chooses the level of each leaf by its distance.  Reading returns the finest level.
@@ -113,7 +113,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 
 def _check_name(path: Path, name: Any) -> str:
-    """Return the name of a meta.json below the folder unchanged.  Raises DataError if it is invalid."""
+    """Return `name` if it is that of a meta.json in a subfolder.  Raises DataError otherwise."""
     if not isinstance(name, str) or not _is_meta_below(name):
         raise DataError(f"{path}: names {quote(name)}; expected a {META} in a subfolder; export it again")
     return name
@@ -220,7 +220,7 @@ class Node:
 
 
 def build_tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
-    """Build the tree of all levels, which start with the finest and are not empty."""
+    """Build the tree of all levels.  levels: not empty, finest first."""
     means = np.concatenate([level["means"] for level in levels]).astype(np.float64)
     reach, max_extent = np.concatenate([half_boxes(level) for level in levels]), limits.extent * typical_size(means)
     starts = np.cumsum([0, *(len(level["means"]) for level in levels)])
@@ -243,7 +243,7 @@ def build_tree(levels: Sequence[Parameters], limits: LeafLimits) -> Node:
 
 
 def half_boxes(level: Parameters) -> Floats:
-    """Return half the sides of the bounding boxes of Gaussians at one sigma, [N, 3] scene units."""
+    """Return half the side lengths of the bounding boxes of Gaussians at one sigma, [N, 3] scene units."""
     from scipy.spatial.transform import Rotation
 
     axes = np.abs(Rotation.from_quat(np.roll(unit(level["quats"]), -1, axis=1)).as_matrix())

@@ -74,7 +74,7 @@ class Codec:
 
 
 def model_file(path: Path) -> Path:
-    """Return the main file of a model, which in a folder is its meta.json or lod-meta.json."""
+    """Return the main file of a model: the meta.json or lod-meta.json of a folder, else the path itself."""
     files = (path / name for name in (META, LOD_META)) if path.is_dir() else ()
     return next(filter(Path.is_file, files), path)
 
@@ -183,7 +183,7 @@ CODECS = (
 
 
 def endings(reads: bool = False) -> list[str]:
-    """Return the file name endings of the formats that can be written, or with `reads`, that can be read."""
+    """Return the file name endings of all formats that can be written, or with `reads`, of all that can be read."""
     return [end for codec in CODECS if (codec.read if reads else codec.write) for end in codec.endings]
 
 
@@ -243,7 +243,7 @@ def write(path: Path, splats: SplatFile, options: WriteOptions | None = None) ->
 
     Returns the SHA-256 of the file; for a SOG folder, that of its meta.json.
     Raises ConfigError for an unknown name, DataError for a model that the format cannot store, OutputError if the file
-    cannot be written, and ValueError for a world filter that is not baked: only a PLY stores one.
+    cannot be written, and ValueError for a world filter that is not baked, since only a PLY can store it.
     """
     codec = writing_format(path)
     assert codec.write is not None

@@ -221,7 +221,8 @@ def convert(
 ) -> dict[str, Any]:
     """Read model files or run folders and write all their Gaussians to one file, in the format of its name.
 
-    Returns `file`, `format`, `gaussians`, `bytes`, and `bytes_read`.  Raises ConfigError, DataError, OutputError.
+    Returns a dictionary with `file`, `format`, `gaussians`, `bytes`, and `bytes_read`.
+    Raises ConfigError, DataError, OutputError.
     """
     if not sources:
         raise ConfigError("convert: expected at least one model file to read, and one to write")
@@ -328,7 +329,7 @@ def check_degree(degree: int | None) -> int | None:
 def _extract_frame(model: Model, time: float) -> Model:
     """Return a moving model at one time, as a static model.
 
-    Raises ConfigError if the model does not move, and DataError if nothing is visible.
+    Raises ConfigError if the model does not move, and DataError if no Gaussian is visible at that time.
     """
     if model.motion is None:
         raise ConfigError("the model does not move; omit --time and --frames")
@@ -364,7 +365,7 @@ def convert_frames(
     """Write static models at `frames` timestamps, evenly spaced from start to end.
 
     out: a folder for numbered PLY files, or a file name to which numbers are added.
-    Returns the same as `convert`, with sums over files, the largest number of `gaussians`, and `files`.
+    Returns the dictionary of `convert`, with `files`, their total `bytes`, and the largest number of `gaussians`.
     Raises ConfigError, DataError, OutputError.
     """
     if not 2 <= frames <= MAX_FRAMES:
@@ -399,7 +400,7 @@ def convert_frames(
 
 @contextmanager
 def _restore_on_failure(files: Sequence[Path]) -> Iterator[None]:
-    """If the block fails, for example on a full disk, restore files in one folder, and remove the folder if it is new.
+    """If the block fails, for example on a full disk, restore `files`, and remove their folder if it is new.
 
     Raises OutputError.
     """
@@ -426,7 +427,7 @@ def _restore_on_failure(files: Sequence[Path]) -> Iterator[None]:
 
 
 def _link_or_copy(file: Path, target: Path) -> None:
-    """Hard-link a file, or copy it on a file system without hard links.  Files are replaced, never changed in place."""
+    """Hard-link a file, or copy it if that fails.  Links suffice, as files are replaced, never changed in place."""
     try:
         os.link(file, target)
     except OSError:
@@ -536,7 +537,7 @@ def from_points(points: PointCloud, opacity: float, degree: int, scale: float = 
 
 
 def neighbor_distance2(positions: NDArray[np.floating], extent: float) -> NDArray[np.float64]:
-    """Return the mean squared distance to the three nearest neighbors, [N] scene units².
+    """Return each position's mean squared distance to its three nearest neighbors, [N] scene units².
 
     extent: the extent of the scene in scene units, used instead of the distance if there is only one point.
     """

@@ -175,7 +175,7 @@ class Model:
         return {name: table for name, table in tables.items() if table is not None}
 
     def at(self, time: float) -> "Model":
-        """Return the static model at a time from 0 to 1, with the Gaussians visible then; a static model is unchanged.
+        """Return the static model of the Gaussians visible at a time from 0 to 1; a static model is returned unchanged.
 
         Raises ValueError for other times, and DataError if some positions are not finite.
         """
@@ -239,8 +239,8 @@ class Model:
     ) -> "Model":
         """Return the model after x -> scale · rotation x + translation; view-dependent colors rotate with it.
 
-        rotation: [3, 3]; translation: [3] scene units, added to the origin if the model has one, else to the means; if
-        float32 is too coarse for these, the result has an origin.
+        rotation: [3, 3]; translation: [3] scene units, added to the origin if the model has one, else to the means; the
+        result has an origin if float32 is too coarse for the new means.
         Raises ValueError for a matrix that is not a rotation, and if the result does not fit in a model file.
         """
         matrix = np.eye(3) if rotation is None else np.asarray(rotation, np.float64)
@@ -290,7 +290,7 @@ class Model:
     def baked(self) -> "Model":
         """Return the model with the world filter baked into scales and opacities (Yu et al. 2024, eq. 9).
 
-        It then looks the same in viewers without that filter.
+        The result looks the same in viewers without that filter.
         """
         if self.filter_variance is None:
             return self
@@ -310,8 +310,8 @@ class Model:
         A PLY stores a world filter as the property `filter_3D`; for other formats, it is baked.  A sky is written next
         to the model as NAME_sky.json, which contains the SHA-256 of the model file, so that no other model uses it.
         Returns the SHA-256 of the file, or of meta.json for a SOG folder.
-        Raises ConfigError for an unknown extension or world coordinates that the format cannot hold, and OutputError if
-        the file cannot be written.
+        Raises ConfigError for an unknown extension or world coordinates that the format cannot store, and OutputError
+        if the file cannot be written.
         """
         model = self if writing_format(Path(path)).keeps_all else self.baked()
         splats = model.to_splat_file() if not (options and options.world) else model._in_world(Path(path))

@@ -25,7 +25,7 @@ def static_motion(count: int, width: int) -> NDArray[np.float32]:
 
 
 def presence(motion: NDArray[np.floating], time: float | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the factor on each opacity, [N] in (0, 1], at one time, or at a separate time for each Gaussian, [N]."""
+    """Return the factor on each opacity, [N] in (0, 1].  time: one number, or one for each Gaussian, [N]."""
     fields, table = motion_fields(motion.shape[1]), motion.astype(np.float64)
     dt = np.reshape(time, (-1, 1)) - table[:, fields["time_center"]]
     with np.errstate(over="ignore"):
@@ -66,7 +66,7 @@ def transform_motion(motion: NDArray[np.floating], scale: float, rotation: NDArr
 
 
 def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Parameters]:
-    """Return the tables of several models; if any model moves, the others get static motion.
+    """Return the tables of each model; if any model moves, the others get static motion.
 
     Raises DataError if their motions have different columns.
     """

@@ -1,8 +1,8 @@
 """Offload the SH bands above 0 and their moments to host memory.
 
-They take 540 of the 708 bytes of a Gaussian of SH degree 3 with its moments.  The device stores the blocks of LANES
-rows that are visible in a view in slots (cl_kernels/slots.h), in row order.  They are uploaded before the view is
-rendered, and downloaded before the next view.
+They take 540 of the 708 bytes of a Gaussian of SH degree 3 with its moments.  Blocks have LANES rows.  Slots on
+the device (cl_kernels/slots.h) store the blocks that are visible in a view, in row order.  These blocks are uploaded
+before the view is rendered, and downloaded before the next view.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,7 +23,7 @@ class HostTables:
     """Tables of Gaussians in host memory, each [blocks, components, LANES]; a block has LANES rows."""
 
     def __init__(self, gaussians: Struct) -> None:
-        """gaussians: the Gaussians whose SH tables are offloaded; slots replace these in its `tables`."""
+        """gaussians: the Gaussians whose SH tables are offloaded; slots replace these tables in `gaussians.tables`."""
         self.gaussians, self.device = gaussians, gaussians.device
         self.lanes = int(self.device.tuning["LANES"])
         self.tables: dict[str, NDArray[np.float32]] = {}

@@ -73,7 +73,7 @@ class GaussianGradients:
         return self.arrays[name]
 
     def without_deferred(self) -> "GaussianGradients":
-        """Return a copy with the same arrays that raises ConfigError on access to arrays with deferred updates."""
+        """Return a copy that shares the arrays, but raises ConfigError on access to an array with deferred updates."""
         gradients = copy.copy(self)
         gradients._withheld_names = ("sh_rest",)
         return gradients

@@ -24,7 +24,7 @@ DEGENERATE = {"not_finite": "not finite", "no_rotation": "without rotation", "fl
 
 
 def is_model(path: Path) -> bool:
-    """Return whether a path is a model, by name or content, or another binary file; False for pipeline files."""
+    """Return whether a path is a model and not a pipeline: by its name or content, or because it is a binary file."""
     file = model_file(path)
     if file.suffix in (".yaml", ".yml"):
         return False

@@ -79,7 +79,7 @@ class ViewLosses:
 
     @property
     def loss(self) -> float:
-        """The sum of the losses, including penalties after an update; waits for the device."""
+        """The sum of the view's losses, and after an update also of the penalties; waits for the device."""
         return sum(loss.value() for loss in self.losses)
 
 

@@ -24,7 +24,7 @@ class InverseDepth(ImageLoss):
     type: Literal["inverse_depth"] = "inverse_depth"
     folder: InputPath | None = None
     """Folder of depth maps, one per photo: `a.png` for a.jpg, 8 or 16 bits, linear in 1/z, bright is near.  Each
-    is fitted to the points of its photo, and used instead of them.  Default: only points."""
+    map is fitted to the points of its photo, and used instead of them.  Default: only points."""
     reads_photograph: ClassVar[bool] = False
 
     def reads(self, step: int) -> Content:

@@ -58,7 +58,7 @@ class HostLoss(ImageLoss):
         return LossValue(self.name, lambda: weight * value)
 
     def _call(self, image: NDArray[np.float32], photograph: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
-        """Call the function; return its value and gradient.  Raises ValueError if the result has a wrong form."""
+        """Call the function; return its value and gradient.  Raises ValueError if the result is invalid."""
         result: Any = self._function(image, photograph)
         try:
             value, derivative = result

@@ -75,7 +75,7 @@ def _pixel_loss(comparison: Comparison, arguments: dict[str, Any]) -> Array:
 
 
 def psnr(comparison: Comparison) -> float:
-    """Return the PSNR of unmasked pixels, dB, before rounding to 8 bits; waits for the device."""
+    """Return the PSNR of unmasked pixels in dB, without rounding them to 8 bits; waits for the device."""
     squares = pixel_loss(comparison, l1=0.0, l2=0.0).get()[..., 1]
     error = float(squares.sum(dtype="float64")) / comparison.unmasked_size
     return -10 * math.log10(max(error, 1e-10))

@@ -34,11 +34,11 @@ class Momentum(Budget):
     keep: Annotated[float, Field(ge=0, lt=1)] = 0.98
     """Factor on the momentum from one edit to the next."""
     gradient_above: Positive = 2.0e-4
-    """Smallest mean of `screen_grad` of a Gaussian that could grow."""
+    """Smallest mean of `screen_grad` at which a Gaussian counts as able to grow."""
     max_added: Annotated[int, Field(gt=0)] = 1_000_000
     """Largest number of Gaussians that one edit adds to the momentum."""
     growth: Annotated[float, Field(gt=0)] = 0.2
-    """Largest increase by one edit, as a fraction of the Gaussians."""
+    """Largest increase by one edit, as a fraction of the number of Gaussians."""
 
     @property
     def statistics(self) -> set[str]:

@@ -109,7 +109,7 @@ class ErrorGain(Statistic):
 
 
 class ViewError(Statistic):
-    """Error of all views, including views in which the Gaussian is not visible, measured by the losses."""
+    """Image error, weighted like the losses, over all views, even if the Gaussian is not visible in them."""
 
     type: Literal["view_error"] = "view_error"
 

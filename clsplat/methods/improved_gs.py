@@ -58,7 +58,7 @@ class SplitLongAxis(Rule):
     opacity: Annotated[float, Field(gt=0, le=1)] = 0.6
     """Opacity of each child, as a fraction of the parent's."""
     long_axis: Annotated[float, Field(gt=0, le=1)] = 0.55
-    """Factor on the longest scale; with `distance`, the children end where the parent ends."""
+    """Factor on the longest scale; with the default `distance`, the children end where the parent ends."""
     other_axes: Annotated[float, Field(gt=0, le=1)] = 0.85
     """Factor on the other scales."""
 
@@ -92,8 +92,8 @@ class SplitLongAxis(Rule):
 class PruneLowestOpacity(Rule):
     """Remove the fraction of Gaussians with the lowest opacities.
 
-    Use it some steps after a reset of all opacities.  Gaussians that many views need have then recovered, and the
-    faintest Gaussians fit only a few views.
+    Use it some steps after a reset of all opacities.  By then, the Gaussians that many views need have recovered,
+    and the faintest Gaussians fit only a few views.
     """
 
     type: Literal["prune_lowest_opacity"] = "prune_lowest_opacity"

@@ -86,9 +86,9 @@ def divide_opacity(
 class AddNoise(Scheduled):
     """Add noise to the means, proportional to each Gaussian's covariance; opaque Gaussians do not move.
 
-    The noise is rate / (1 + exp(-100 (opacity_below - opacity))) Σ n / extent, with n three standard normal numbers; it
-    vanishes 0.1 above that opacity.  The published code multiplies by the extent; dividing by it makes the rate
-    independent of the unit of length.
+    The noise is rate / (1 + exp(-100 (opacity_below - opacity))) Σ n / extent, with n a standard normal vector; it is
+    negligible if the opacity is 0.1 above `opacity_below`.  The published code multiplies by the extent; dividing by it
+    makes the rate independent of the unit of length.
     """
 
     stage: Literal["add_noise"] = "add_noise"
@@ -97,7 +97,7 @@ class AddNoise(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "opacity_below"})
 
     rate: NonNegative = 80.0
-    """Scale of the noise. Published: 5e5 times the learning rate of the means, times the squared extent."""
+    """Scale of the noise.  Published: 5e5 times the learning rate of the means, times the squared extent."""
     opacity_below: Positive = 0.005
     """Opacity at which the noise is half as strong."""
 

@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 def sampled_weights(survey: Survey, weight_per_view: float | None = None, number: int | None = None) -> Weights:
     """Return the blend weights of all Gaussians in training views.
 
-    weight_per_view: as in `weights`.  number: number of views to sample; None for all views.
+    weight_per_view: see `weights`.  number: number of views to sample; None for all views.
     """
     views = survey.views if number is None else survey.sample_views(number)
     return weights(survey.render(views), survey.count, weight_per_view)
@@ -58,7 +58,7 @@ class PruneUseless(Rule):
     views: Annotated[int, Field(ge=1)] | None = None
     """Number of training views, sampled by seed and step; default: all."""
     views_below: Annotated[int, Field(ge=0)] = 2
-    """Smallest number of views in which a Gaussian must be useful; others are removed."""
+    """Gaussians that are useful in fewer views are removed."""
     weight_total: Share = 0.999
     """Fraction of the weight in all views that is kept; the smallest weights are removed."""
 
@@ -69,7 +69,7 @@ class PruneUseless(Rule):
 
 
 class HideUseless(Scheduled):
-    """Skip Gaussians that contribute little to a training view in the steps that train on it, to save time
+    """Save time in a training step by skipping the Gaussians that contribute little to its training view
     (Mini-Splatting2, Fang and Wang 2024).
 
     The Gaussians with the largest weights that make up `weight_per_view` of a view's weight, alpha T over all pixels,

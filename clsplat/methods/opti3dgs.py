@@ -83,7 +83,7 @@ class HaarState(ModuleState):
         step.planes = apply_filter(step.planes, self.filter)
 
     def before_losses(self, step: TrainingStep) -> None:
-        """Compute the gradient of the photo before the losses, because a loss keeps the sums of its last call."""
+        """Compute the photo's gradient before the losses run, because a loss keeps only the sums of its last call."""
         self.settings.check_losses(step.loss_settings)
         gradient = photograph_gradient(step.loss_settings, step.comparison)
         if step.planes.mask is not None:

@@ -1,8 +1,8 @@
 """Split Gaussians where a split immediately lowers the loss, as in SteepGS (Wang et al. 2025).
 
 This is the case if the splitting matrix S has a negative eigenvalue.  If a Gaussian's weight in the pixels is replaced
-with the mean of two copies moved by ±ε v, the loss changes by ε²/2 vᵀ S v + O(ε⁴).  Two Gaussians with a part of its
-opacity form such a mean, except for the product of their alphas.
+with the mean of two copies moved by ±ε v, the loss changes by ε²/2 vᵀ S v + O(ε⁴).  Two Gaussians, each with a
+part of its opacity, form such a mean, except for the product of their alphas.
 """
 
 from typing import Annotated, ClassVar, Literal

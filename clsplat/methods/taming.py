@@ -30,10 +30,10 @@ def pixel_weights(render: RenderedView) -> Floats:
 
 
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
-    """Return two sums over sampled views for each Gaussian, [N]: the losses, and its terms times the losses.
+    """Return two sums over sampled views for each Gaussian, [N]: of the view's loss, and of its terms times that loss.
 
-    Only views in which the Gaussian is visible count.  Its terms are its depth, its radius, and three sums over the
-    pixels where it is blended: `pixel_weights`, the number of pixels, and its blend weights.
+    Only views in which the Gaussian is visible count.  The terms of a Gaussian are its depth, its radius, and three
+    sums over the pixels where it is blended: `pixel_weights`, the number of pixels, and its blend weights.
     """
     losses, terms = np.zeros(survey.count), np.zeros(survey.count)
     sampled_views = survey.sample_views(views)
@@ -73,7 +73,7 @@ class ScoredRule(Rule):
 
 
 class GrowScored(ScoredRule):
-    """Undo growth by earlier rules that exceeds the limit of the edit (`max_gaussians`, `budget`, memory).
+    """Undo the part of earlier rules' growth that exceeds the limit of the edit (`max_gaussians`, `budget`, memory).
 
     Gaussians that may grow are sampled by score.  Clones and splits share the limit in proportion to their numbers.
     """

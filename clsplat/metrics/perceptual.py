@@ -29,7 +29,7 @@ class Lpips:
     """Learned perceptual distance (Zhang et al. 2018); 0 for equal images.
 
     The ONNX file is the output of `clsplat data lpips`, or of `torch.onnx.export` for `lpips.LPIPS(net="vgg")` with
-    dynamic height and width.  It has two inputs, `in0` and `in1`, RGB of [1, 3, height, width], and a scalar output.
+    dynamic height and width.  It has two inputs, `in0` and `in1`, RGB, [1, 3, height, width], and a scalar output.
     The network expects values in [-1, 1]; 3DGS and Mip-Splatting report its results for values in [0, 1].
     """
 
@@ -215,7 +215,7 @@ def _window_mean(image: Floats) -> Floats:
 
 
 def flip(image: Image, photograph: Image) -> float:
-    """Return the mean FLIP (Andersson et al. 2020) at 67 px per degree.  Raises ConfigError without its package."""
+    """Return the mean FLIP (Andersson et al. 2020) at 67 px per degree.  Raises ConfigError if it is not installed."""
     reference, test = (np.ascontiguousarray(pixels, np.float32) / np.float32(255) for pixels in (photograph, image))
     _, mean, _ = _flip_package().evaluate(reference, test, "LDR", applyMagma=False)
     return float(mean)

@@ -62,7 +62,7 @@ class CameraSums:
 
 
 class FlickerMeter:
-    """Measures flicker from sums over the views of each camera.  Moving cameras and single timestamps are ignored."""
+    """Measures flicker from sums over the views of each camera; cameras that move or have one timestamp are ignored."""
 
     def __init__(self, views: Sequence[View]) -> None:
         """views: all views that will be added, in any order."""
@@ -75,7 +75,7 @@ class FlickerMeter:
         return len(self._cameras)
 
     def add(self, view: View, rendered: Image, photograph: Image, unmasked: Mask | None) -> dict[str, float]:
-        """Add a view's 8-bit images, [H, W, 3]; return its PSNR of static pixels, if a file marks them."""
+        """Add a view's 8-bit images, [H, W, 3]; return the PSNR of its static pixels if a file marks these."""
         static = static_pixels(view)
         mask = static if unmasked is None else unmasked if static is None else static & unmasked
         if view.time is not None:
@@ -336,7 +336,7 @@ def measure(
 
     Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.  check_finite: raise
     NumericError for a render that is not finite, instead of counting it as black.  colors: color model for
-    `psnr_color`.  progress: the views wrapped by a progress counter.  train_views: the training views, for metrics by
+    `psnr_color`.  progress: the views, wrapped in a progress counter.  train_views: the training views, for metrics by
     timestamp.
     """
     results, flicker_meter, empty_names = list[ViewMetrics](), FlickerMeter(views), list[str]()

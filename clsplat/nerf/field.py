@@ -120,7 +120,7 @@ class RayRenderer:
     def differentiate(self, parameters: Array, level: SampleLevel, target: RayTarget, gradient: Array) -> None:
         """Add the gradient of the loss of the last rendered level to `gradient`, [P].
 
-        Also writes the squared differences between its rays and the target.
+        Also writes the squared differences between the level's rays and the target to `target.errors`.
         """
         rays, tiles = level.rays, level.raw_colors.shape[0]
         grad_colors, grad_densities = (

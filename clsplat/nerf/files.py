@@ -47,7 +47,7 @@ class Metadata(BaseModel):
 class FieldModel:
     """A field on the host, as `train_field` trains it.
 
-    Raises ValueError if the parameters do not fit the shape, its unit is not a number, or the origin is not 3 numbers.
+    Raises ValueError if the parameters do not fit the shape, the unit is not a number, or the origin is not 3 numbers.
     """
 
     shape: FieldShape
@@ -80,7 +80,7 @@ class FieldModel:
         return Field(self.shape, device.upload(self.parameters), background)
 
     def save(self, path: str | Path) -> str:
-        """Write the field to a file, and return the file's SHA-256.  Raises OutputError when it cannot be written."""
+        """Write the field to a file, and return the file's SHA-256.  Raises OutputError if it cannot be written."""
         path, rendering = Path(path), self.rendering
         metadata = Metadata(
             format=FORMAT,

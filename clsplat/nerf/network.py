@@ -110,7 +110,7 @@ class Network:
         return grad_grid
 
     def _grid_gradient(self, layer: DenseLayer, parameters: Array, grad_outputs: Array, row: int, add: int) -> Array:
-        """Compute the gradient of the grid's features, which are inputs of a layer from a row on."""
+        """Compute the gradient of the grid's features, which are a layer's inputs from `row` on."""
         tiles = grad_outputs.shape[0]
         position, grad_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
         self._differentiate(layer, parameters, grad_outputs, position, grad_grid, NO_LIMIT, add, row)
@@ -157,7 +157,7 @@ class Network:
         add: int = 0,
         row: int = 0,
     ) -> None:
-        """Compute the gradient of a layer's inputs, for its weights from `row` on.  add: 1 to add to `grad_inputs`."""
+        """Compute the gradient of a layer's inputs, starting with input `row`.  add: 1 to add to `grad_inputs`."""
         tiles, grad_rows, output_rows = *grad_inputs.shape[:2], grad_outputs.shape[1]
         count = tiles * self._columns * (grad_rows // BLOCK)
         self._program.dense_backward(

@@ -35,7 +35,7 @@ class GridShape(Settings):
     finest: Annotated[int, Field(ge=1, le=4096)] = 256
     """Cells along a side in the last level; with one level, the same as `coarsest`."""
     entries: Annotated[int, Field(ge=16, le=1 << 22)] = 1 << 17
-    """Largest number of entries of a level, a power of 2; levels with more corners share entries by a hash."""
+    """Largest number of entries of a level, a power of 2; levels with more grid corners share entries by a hash."""
     corner: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] = Field([-1.5, -1.5, -1.5])
     """Corner of the cube with the smallest coordinates, in units of `unit`."""
     side: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 3.0
@@ -122,9 +122,9 @@ class FieldShape(Settings):
         in_one_sentence(f"expected 'auto' or a length from {1 / UNIT_MAX:g} to {UNIT_MAX:g}"),
     ] = "auto"
     """The unit of all lengths in the field, in scene units; `auto`: the median distance of the training cameras from
-    the point that they look at, divided by 4.03, so that it is 1 for the Blender scenes.  A run writes the length."""
+    the point that they look at, divided by 4.03, so that it is 1 for the Blender scenes.  A run writes this length."""
     unit_auto: UnitLength | None = None
-    """Written by a run: the length that `auto` chose.  With other photos, `unit` is chosen again if it equals this."""
+    """Written by a run: the length that `auto` chose.  While `unit` equals it, other photos lead to a new choice."""
     near: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 2.0
     """Depth at which the samples of a ray start, in units of `unit`; 2 for the Blender scenes."""
     far: Annotated[float, Field(gt=0, le=FARTHEST)] = 6.0
@@ -257,7 +257,7 @@ class FieldShape(Settings):
 
 
 def _require_all_keys(value: Any) -> Any:
-    """Return the keys of a shape in a file, in scene units if it has no unit.
+    """Return the keys of a shape from a file; a shape without a unit is in scene units.
 
     Raises ValueError if another key is missing, since defaults may have changed, or if the unit is not a number.
     """

@@ -98,7 +98,7 @@ class Recording(threading.local):
     plan: Any = None
 
     def spoil(self) -> None:
-        """Note a command that a plan cannot repeat."""
+        """Mark the plan as not replayable, because of a command that is not a launch."""
         if self.plan is not None:
             self.plan.is_fixed = False
 
@@ -149,7 +149,7 @@ class Array:
         return self.get_item_later(index)()
 
     def get_item_later(self, index: int) -> Callable[[], Any]:
-        """Start to copy one value of a one-dimensional array to the host, like `get_later`."""
+        """Start a copy of one value of a one-dimensional array to the host, like `get_later`."""
         wait = self._copy_later(np.empty(1, self.dtype), src_offset=index * self.dtype.itemsize)
         return lambda: wait()[0].item()
 
@@ -462,7 +462,7 @@ class Kernel:
         return kernel
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
-        """Launch `items` work-items, rounded up to full work-groups, or `groups` work-groups; none if a size is 0."""
+        """Launch `items` work-items, rounded up to full work-groups, or `groups` work-groups; no-op if a size is 0."""
         total = items or groups
         size = (total,) if isinstance(total, int) else total
         local = self.group[: len(size)]

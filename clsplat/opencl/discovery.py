@@ -25,7 +25,7 @@ Schedule = Literal["auto", "wide", "simt"]
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """The properties of a device, and its index among platforms and devices."""
+    """The properties of a device, the index of its platform, and its index on that platform."""
 
     name: str
     platform: str  # name and version of the runtime
@@ -55,7 +55,7 @@ class DeviceInfo:
         return runtimes.probe_fault(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.index)
 
     def matches(self, device_name: str) -> bool:
-        """Return whether `device_name` is part of the platform, name, and kind, ignoring case."""
+        """Return whether the text of platform, name, and kind contains `device_name`, ignoring case."""
         return device_name.lower() in f"{self.platform} {self.name} {self.kind}".lower()
 
 
@@ -144,7 +144,7 @@ def choose_device(device_name: str | None = None) -> DeviceInfo:
 
 
 def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
-    """Return the sort key: GPUs first, discrete before integrated, by units times clock; then CPUs, then others.
+    """Return the sort key: GPUs (discrete first, by compute units times clock), then CPUs, then other devices.
 
     The number of units alone does not suffice, because vendors define compute units differently.
     """

@@ -96,7 +96,7 @@ class Plan:
                 raise
 
     def release(self) -> None:
-        """Return the kernels, which later plans use again: some runtimes take 0.2 ms to create one."""
+        """Release the kernels for use in later plans, because some runtimes take 0.2 ms to create one."""
         for launch in self.launches:
             launch.source.spare.append(launch.kernel)
         self.launches = []

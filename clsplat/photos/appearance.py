@@ -74,7 +74,7 @@ class ViewTable:
         self.center(scalars)
 
     def update(self, scalars: dict[str, float], view: str, gradient: Floats, rate: float) -> None:
-        """Update the row of a view with Adam, which counts the updates of each row.  Then center a centered table."""
+        """Update a view's row with Adam, which counts updates for each row; then center the table if `is_centered`."""
         values = {key: scalars.get(key, 0.0) for key in self.keys(view)}
         adam_step(scalars, values, dict(zip(values, map(float, gradient), strict=True)), rate)
         if self.is_centered:

@@ -137,7 +137,7 @@ class PointDepths:
         self._cache: dict[tuple[int, int, int], KnownDepths | None] = {}
 
     def at(self, camera: DeviceCamera) -> KnownDepths | None:
-        """Return the known depths of the camera's training view.  None if there are none, or for other cameras.
+        """Return the known depths for the camera of a training view; None if there are none, or for another camera.
 
         Raises DataError if a depth map cannot be read.
         """
@@ -169,8 +169,8 @@ def nearest_in_pixels(
 ) -> tuple[NDArray[np.intp], NDArray[np.floating], NDArray[np.intp]]:
     """Project positions, [M, 3], to pixels, and return the nearest position in each pixel.
 
-    Returns three arrays, [K]: the ascending indices of the pixels in a plane, and the depths and the rows of their
-    positions.  Among equally near positions, the first is used.  Positions outside the image are dropped.
+    Returns three arrays, [K]: the indices of the pixels in a plane, ascending, and the depth and row of each pixel's
+    position.  Among equally near positions, the first is used.  Positions outside the image are dropped.
     """
     values = camera.values
     pose = np.asarray(values["world_to_camera"], np.float64).reshape(3, 4)

@@ -82,11 +82,11 @@ class DetailDivisor(Settings):
     follows: Literal["detail"]
     """`detail`: the mean spectrum of the training photos."""
     until: Annotated[int, Field(gt=0, le=10**6)]
-    """Global step at which photos are at full size; up to a million."""
+    """Global step from which photos are at full size; at most a million."""
     largest: Annotated[float, Field(ge=1)] = 8
     """Largest downscale factor."""
     every: EverySteps = 100
-    """Steps between changes, as between edits; may be fractional."""
+    """Steps between possible changes of the size; may be fractional."""
     start: Annotated[int, Field(ge=0)] = 500
     """Global step after which the size changes."""
 
