@@ -1,8 +1,9 @@
 """Estimate the relative exposures of photographs from pixels that show the same points.
 
-For each channel, a pixel y is modeled by ln y = e + a, where e is the exposure of the photograph and a is the color of
-the point.  The estimate minimizes the sum of |ln y - e - a| exp(a), which is robust to hidden, glossy, or misplaced
-points.  The factor exp(a) converts log differences to pixel differences, so that haze on a dark point counts little.
+For each channel, a pixel value y is modeled as ln y = e + a, where e is the log exposure of the photograph and a is the
+log color of the point.  The estimate minimizes the sum of |ln y - e - a| exp(a), which is robust to hidden, glossy, or
+misplaced points.  The factor exp(a) converts log differences to pixel differences, so haze on a dark point counts
+little.
 The solver is iteratively reweighted least squares with conjugate gradients.  All sums have a fixed order.
 """
 
@@ -46,7 +47,7 @@ class Exposures:
 
     @property
     def summary(self) -> str:
-        """A summary for messages."""
+        """The number, spread, and source of the exposures as text, for messages."""
         if not self.log_gains:
             return self.source
         return f"exposures of {len(self.log_gains)} photos differ by {self.spread:.1%} {self.source}"
@@ -56,9 +57,10 @@ UNKNOWN = Exposures({}, "neither tracks nor EXIF gives exposures")
 
 
 def exif_exposures(views: Sequence[View]) -> Exposures:
-    """Compute exposures from EXIF data, EV = log2(t ISO / N²), for image values with a gamma of 2.2.
+    """Compute exposures from EXIF data as log2(t ISO / N²), for image values with a gamma of 2.2.
 
-    Real tone curves differ, so the result is only an initial value.
+    t is the exposure time in seconds, and N is the f-number.  Real tone curves differ, so the result is only an initial
+    value.
     """
     values = {view.name: exif.value for view, exif in zip(views, load_exposures(views), strict=True) if exif}
     if not values:
@@ -88,7 +90,9 @@ def complete_exposures(base: Exposures, exif: Exposures) -> Exposures:
 
 
 def measure_exposures(tracks: Tracks, views: Iterable[View], read: PhotographReader) -> Exposures:
-    """Measure the exposures of photographs on tracks.  Of several views with the same name, only the first is used.
+    """Measure the exposures of photographs at the points of tracks.
+
+    Of several views with the same name, only the first is used.
 
     read: a function that returns the photograph of a view, [height, width, 3], and its mask.
     """
@@ -151,7 +155,7 @@ def _fit(
 
 
 def _corrections(photograph: Integers, point: Integers, target: Floats, weights: Floats, count: int) -> Floats:
-    """Solve by conjugate gradients for the exposures, [count], that fit `target` best, with one color per point."""
+    """Return the exposures, [count], that fit `target` best with one color per point, found by conjugate gradients."""
 
     def apply(values: Floats) -> Floats:
         differences = weights * (values - _means(point, values, weights)[point])

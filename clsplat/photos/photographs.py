@@ -52,7 +52,7 @@ class Photograph:
         step: int = 0,
         backgrounds: tuple[Array, Array] | None = None,
     ) -> Planes:
-        """Return the photograph as float planes, padded to full tiles, after the transforms of a global step.
+        """Return the photograph as float planes, padded to full tiles, with the transforms of a global step applied.
 
         backgrounds: the background color of the photographs, and the color that replaces it, each [3] in [0, 1].
         """
@@ -226,7 +226,7 @@ BINS = 3000
 
 
 def image_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, name: str = "texture") -> Array:
-    """Compute the gradient magnitudes, [rows, stride] per px, of an image, [3, rows, stride] in [0, 1]."""
+    """Compute the gradient magnitudes, [rows, stride] in 1/px, of an image, [3, rows, stride] in [0, 1]."""
     magnitude = workspace.array(name, (camera.rows, camera.stride))
     device = workspace.device
     device.program("texture.cl").image_gradient(
@@ -254,7 +254,7 @@ def unmasked_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, 
 
 
 def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], quantile: float) -> float:
-    """Compute a quantile of the gradient magnitude over all unmasked pixels, per px, rounded up to 1 / 4000."""
+    """Compute a quantile of the gradient magnitude over all unmasked pixels, in 1/px, rounded up to 1 / 4000."""
     counts = np.zeros(BINS, np.int64)
     for photograph in photographs:
         camera, planes = photograph.camera, photograph.planes(workspace)

@@ -73,8 +73,8 @@ class ShuffleOrder(Order):
 
 
 class StackOrder(Order):
-    """Draw a random view of the finest size in 30 % of the steps, and any view in the others: 47.5, 17.5, 17.5, and
-    17.5 % of the steps for four sizes (the released code of Mip-Splatting)."""
+    """Draw a random view of the finest size in 30 % of the steps, and any view in the other steps: 47.5, 17.5, 17.5,
+    and 17.5 % of the steps for four sizes (the released code of Mip-Splatting)."""
 
     type: Literal["stack"] = "stack"
 

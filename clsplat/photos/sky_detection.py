@@ -49,13 +49,13 @@ class SkyEvidence:
 
     @property
     def upper_pixels(self) -> Image:
-        """The unmasked pixels of the upper third, [K, 3]."""
+        """The colors of the unmasked pixels in the upper third of the photograph, [K, 3]."""
         rows = slice(max(1, len(self.image) // 3))
         return np.asarray(self.image[rows][self.unmasked[rows]])
 
     @property
     def directions(self) -> NDArray[np.float64]:
-        """The ray directions of the pixels in the scene, [height, width, 3], not normalized."""
+        """The ray directions of the pixels in scene coordinates, [height, width, 3], not normalized."""
         height, width = self.mask.shape
         camera, rotation = self.view.camera, self.view.world_to_camera[:, :3].astype(np.float64)
         x = ((np.arange(width) + 0.5) * camera.width / width - camera.cx) / camera.fx
@@ -108,9 +108,9 @@ def panorama(photos: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float
 
 
 def sky_mask(image: Image, points: NDArray[np.floating], unmasked: Mask) -> Mask:
-    """Return a mask, [height, width], of the unmasked pixels of a reduced photograph that show the sky.
+    """Return a mask, [height, width], of the unmasked pixels that show the sky in a downscaled photograph.
 
-    points: positions of points, [K, 2] px.  If pixels at the upper edge are masked, the sky may begin below them.
+    points: pixel positions of the dataset's points, [K, 2].  The sky may begin below masked pixels at the upper edge.
     """
     values = image.astype(np.float32) / 255
     brightness = values.mean(axis=2)
@@ -132,7 +132,7 @@ def _blur(values: NDArray[np.float32], mask: Mask) -> NDArray[np.float32]:
 
 
 def _far_from_points(points: NDArray[np.floating], shape: tuple[int, ...]) -> Mask:
-    """Return a mask, `shape`, of the pixels that are far from all points, [K, 2] px."""
+    """Return a mask of size `shape` that is true for pixels far from all points, [K, 2] px."""
     is_far = np.ones(shape, np.uint8)
     column, row = np.floor(points).astype(np.int64).T
     inside = (column >= 0) & (row >= 0) & (column < shape[1]) & (row < shape[0])

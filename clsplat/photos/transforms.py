@@ -45,7 +45,7 @@ class Blur(PhotographTransform):
 
 
 class MeanFilter(PhotographTransform):
-    """Replace each pixel with the mean of a square around it (Opti3DGS, Farooq et al. 2025), without masked pixels."""
+    """Replace each pixel with the mean of the unmasked pixels in a square around it (Opti3DGS, Farooq et al. 2025)."""
 
     type: Literal["mean_filter"] = "mean_filter"
     width: NonNegative

@@ -27,7 +27,7 @@ class Decision(Settings):
 
     @property
     def override(self) -> str:
-        """KEY=VALUE, as in `--set`."""
+        """The decision in the form KEY=VALUE, as for `--set`."""
         return f"{self.key}={json.dumps(self.value)}"
 
 
@@ -38,7 +38,7 @@ class Adaptation(Settings):
 
     type: str
     keep: list[str] = Field([])
-    """Keys that are not decided; `--set` of a key adds it here."""
+    """Keys for which no decision is made; `--set KEY=VALUE` adds KEY."""
     decisions: list[Decision] | None = None
     """Decisions, written by a run.  A run with decisions does not make new ones."""
 
@@ -46,7 +46,7 @@ class Adaptation(Settings):
     def decide(self, training: Optimize, measures: Measures) -> Iterator[Decision]:
         """Yield a decision for each key.  Decisions are validated like `--set`.
 
-        The keys must belong to the model or to a stage, and must not depend on the measures.
+        The keys must belong to the model or to a stage, and must not depend on `measures`.
         training: the first stage that trains Gaussians.
         """
 

@@ -28,14 +28,14 @@ class Placement(Settings):
     """Which devices may run which cells."""
 
     bits: Literal["same", "any"] = "same"
-    """same: all cells on the largest group of devices that give the same bits; any: each cell within one group."""
+    """same: all cells on the largest group of devices with bit-identical results; any: each cell within one group."""
 
 
 class Tls(Settings):
-    """The certificates for a remote scheduler, PEM files."""
+    """The certificates for a remote scheduler, as PEM files."""
 
     ca: InputPath
-    """Certificate of the authority."""
+    """Certificate of the certificate authority (CA)."""
     cert: InputPath
     """Certificate of this machine."""
     key: InputPath
@@ -159,7 +159,7 @@ class Execution(LocalExecution):
 
 
 def read_execution(file: Path | None) -> dict[str, Any] | None:
-    """Return the keys of a valid execution file as plain data, or None without a file.  Raises ConfigError."""
+    """Read and check an execution file.  Return its keys as plain data, or None without a file.  Raises ConfigError."""
     if file is None:
         return None
     document = read_yaml(file)

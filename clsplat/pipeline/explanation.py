@@ -130,7 +130,7 @@ def explain(error: ValidationError, root: type[BaseModel], path: Path, document:
 def first_fault(error: ValidationError, root: type[BaseModel]) -> tuple[KeyPath, str]:
     """Return the key path and a description of the first fault.
 
-    A misspelled key is reported before a missing key, because it is often the reason for it.
+    A misspelled key is reported before a missing key, because the misspelling is often why a key is missing.
     """
     first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
     key_path, model, annotation = _follow(first["loc"], root)
@@ -162,7 +162,7 @@ def _describe_error(error: dict[str, Any], key_path: KeyPath, model: type[BaseMo
 
 
 def _nearest(name: str, names: list[str]) -> str:
-    """Return a hint at the name that is most similar to an unknown name, or a list of all names."""
+    """Return a hint with the name that is most similar to an unknown name, or with a list of all names."""
     matches = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     if matches:
         return f"; did you mean '{matches[0]}'?"

@@ -3,7 +3,7 @@
     name, seed, scene: {path, downscale, background, …}, model: {…}, rasterizer: {schedule, sort, …}
     stages: a list of   - <stage>   or   - <stage>: {field: value, …}
 
-Unknown keys are errors, and each default is in the model of its key.
+Unknown keys are errors.  The pydantic models in the code define the defaults.
 """
 
 from dataclasses import replace
@@ -42,7 +42,7 @@ class SceneSettings(Settings):
     downscale: Annotated[float, Field(ge=1)] = 1
     """Divisor of the image size."""
     levels: Annotated[int, Field(ge=1, le=8)] = 1
-    """Number of image sizes in training: `downscale`, and twice, four times, … as much."""
+    """Number of image sizes in training, with divisors of `downscale`, twice `downscale`, four times `downscale`, …."""
     alpha: Alpha = "transparency"
     """Alpha channel of images: blended with the background, or a mask of the pixels that count."""
     masks: InputPath | None = None
@@ -61,10 +61,10 @@ class SceneSettings(Settings):
     """Training views held out to choose the best model (`optimize.keep`), as for `holdout`; auto: every 8th, starting
     with the fifth, and at least two."""
     extent: Annotated[float, Field(gt=0)] | None = None
-    """Radius of the scene, scene units, to which sizes and rates are relative; default: that of the training cameras.
+    """Radius of the scene in scene units, to which sizes and rates are relative; default: that of the training cameras.
     To train part of a scene, set the extent of the whole scene."""
     missing: Missing = "refuse"
-    """Images that the dataset names but does not have: refuse the scene, or skip them."""
+    """What to do if images that the dataset names do not exist: refuse the scene, or skip these images."""
 
     @field_validator("masks")
     @classmethod
@@ -91,15 +91,15 @@ class SceneSettings(Settings):
         return Split(self.holdout, self.train, self.validation, self.missing, lists)
 
     def apply_masks(self, scene: Scene) -> Scene:
-        """Return a scene with the masks of these settings.  Raises DataError if their folder has no masks for it."""
+        """Return the scene with masks from the folder `masks`.  Raises DataError if the folder has none for it."""
         return with_masks(scene, None if self.masks is None else Path(self.masks))
 
     def read(self, folder: Path) -> tuple[Scene, Background]:
-        """Read a scene with these settings, and return it with its background.  Raises DataError."""
+        """Read the scene with these settings, and return it with its background color.  Raises DataError."""
         return self.apply(read_scene(folder, self.split))
 
     def apply(self, scene: Scene) -> tuple[Scene, Background]:
-        """Return a scene with these settings of alpha, masks, and extent, and its background.  Raises DataError."""
+        """Return a scene with alpha, masks, and extent applied, and its background color.  Raises DataError."""
         new_scene = replace(self.apply_masks(scene).with_alpha(self.alpha), extent=self.extent or scene.extent)
         return new_scene, scene.background if self.background == "auto" else self.background
 

@@ -39,7 +39,7 @@ def variant_key(path: Path) -> str | None:
 
 
 def variant_name(name: str, key: str) -> str:
-    """Return the name or path of a variant, given those of its pipeline.  Raises ConfigError."""
+    """Return the name or path of a variant, given the name or path of its pipeline.  Raises ConfigError."""
     path = find(name)
     if key.encode() not in VARIANT_KEY.findall(read_file(origin(path), "a pipeline file", ConfigError)):
         raise ConfigError(f"{name}: has no variant '{key}'; use a pipeline that has one, such as `photos`")

@@ -64,7 +64,7 @@ class Pipeline:
         return [key for key in adapt.keys(self.settings.optimize) if key not in adapt.keep]
 
     def preparation(self, out: Path) -> list[PlannedStep]:
-        """Return the preparation steps of a run in `out`, each with the reason to run it, if any.
+        """Return the preparation steps for the run folder `out`, each with the reason why it must run, if any.
 
         Raises DataError or ConfigError.
         """
@@ -103,7 +103,9 @@ def load(name: str, overrides: list[str] | None = None) -> Pipeline:
 
 
 def check_document(path: Path, document: Document, overrides: Sequence[str] = ()) -> Pipeline:
-    """Return the pipeline in a document with overrides; the document stays unchanged.  Raises ConfigError as `load`."""
+    """Return the pipeline in a document with overrides applied.  The document stays unchanged.
+
+    Raises ConfigError like `load`."""
     if not isinstance(document.data, dict):
         raise ConfigError(f"{path}:1: expected keys such as name and stages")
     tagged_data = _tag_file(document, path)
@@ -177,15 +179,15 @@ LENGTHS = ("near", "unit")  # keys that a run replaces with lengths if they are 
 
 
 def apply_adaptation(pipeline: Pipeline, measures: Measures) -> Pipeline:
-    """Return the pipeline with the decisions of its `adapt`; existing decisions stay.  Raises ConfigError."""
+    """Return the pipeline with the decisions of its `adapt`.  Existing decisions are kept.  Raises ConfigError."""
     adapt = pipeline.settings.adapt
     return with_decisions(pipeline, adapt.decide(pipeline.settings.optimize, measures)) if adapt else pipeline
 
 
 def with_decisions(pipeline: Pipeline, decisions: Iterable[Decision]) -> Pipeline:
-    """Return the pipeline with decisions, except for the keys in `adapt.keep`; existing decisions stay.
+    """Return the pipeline with decisions, except for the keys in `adapt.keep`.
 
-    Raises ConfigError.
+    The pipeline is returned unchanged if it already has decisions.  Raises ConfigError.
     """
     if (adapt := pipeline.settings.adapt) is None or adapt.decisions is not None:
         return pipeline
@@ -226,7 +228,7 @@ def _keep_overrides(settings: PipelineFile, key_paths: Sequence[KeyPath]) -> Pip
 
 
 def without_decisions(data: dict[str, Any]) -> dict[str, Any]:
-    """Return a file's data without the decisions of an earlier run, so that they are made again."""
+    """Return a file's data without the decisions of an earlier run, so that a run makes new ones."""
     adapt = data.get("adapt")
     return {**dict(without_auto(data)), "adapt": {**adapt, "decisions": None} if isinstance(adapt, dict) else adapt}
 
@@ -288,7 +290,7 @@ def _untag_stage(stage: dict[str, Any]) -> dict[str, Any]:
 
 
 def _explain_late_stage(stages: Sequence[Stage], need: str) -> str:
-    """Return a text about a stage in `during` that would make `need`, but too late; "" if there is none."""
+    """Return a text about a stage in `during` that would make `need` only after training ends; "" if there is none."""
     step = 0
     for training in stages:
         if not isinstance(training, Training):

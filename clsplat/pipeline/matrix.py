@@ -38,7 +38,7 @@ from clsplat.pipeline.yaml_file import Document, KeyPath, read_pipeline, read_ya
 
 
 def shortest_labels(paths: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return the shortest distinct endings of paths, joined by hyphens."""
+    """Return the shortest ending of each path that is unique among the paths, with its parts joined by hyphens."""
     for length in range(1, max((len(parts) for parts in paths), default=0) + 1):
         names = ["-".join(parts[-length:]) for parts in paths]
         if len(set(names)) == len(names):
@@ -70,7 +70,7 @@ class Matrix(Settings):
     steps: Annotated[int, Field(ge=1)] | None = None
     """Steps of each cell's training; schedules are stretched to fit; default: as in the pipelines."""
     options: list[str] = Field([])
-    """Settings of all cells, as key=value.  In the copy of this file in its folder, a run adds --set and --scene."""
+    """Settings of all cells, as key=value.  A run adds --set and --scene to them in its copy of the file."""
 
     @model_validator(mode="after")
     def _check_axes(self) -> "Matrix":
@@ -229,7 +229,7 @@ def _with_steps(cell: Cell, steps: int) -> Cell:
 def _check_choices(
     path: Path, document: Document, base: _Base, axes: Sequence[Sequence[_Choice]], overrides: Sequence[str]
 ) -> None:
-    """Check each value of the matrix separately.  Raises ConfigError with the key of the first invalid one."""
+    """Check each value of the matrix separately.  Raises ConfigError with the key of the first invalid value."""
     check_document(base.path, base.document, list(overrides))
     for choice in itertools.chain(*axes):
         try:

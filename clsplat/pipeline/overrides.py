@@ -2,7 +2,7 @@
 
 optimize.steps=500              a stage by its name, also inside `during` if the name is unique
 optimize.losses.0.weight=0.5    an item of a list by its index, from 0; losses[0] is the same
-optimize.modules.exposure={}    an item of `modules` by its type: adds or changes it; null removes it
+optimize.modules.exposure={}    an item of `modules` by its type: add or change it; null removes it
 stages.1.steps=500              a stage by its index, if several have the same name
 """
 
@@ -115,7 +115,7 @@ class _Node:
         )
 
     def put(self, name: str, value: Any, text: str) -> None:
-        """Insert a list item of a type in order, or replace the item of that type.  The value None removes it.
+        """Replace the list item of a type, or insert a new item in order.  The value None removes the item.
 
         Raises OverrideError.
         """
@@ -178,7 +178,7 @@ class _Node:
         return self.annotation(key) is None or any(Variants(kind).tag == "stage" for kind in kinds)
 
     def _stage(self, name: str, text: str) -> "_Node | None":
-        """Return the node of the stage with a name, or None.  At the top, stages inside other stages are searched too.
+        """Return the node of the stage with a name, or None.  The root also searches the stages inside other stages.
 
         Raises OverrideError if several stages have the name.
         """
@@ -193,7 +193,7 @@ class _Node:
 
 
 def _to_plain(default: BaseModel) -> dict[str, Any]:
-    """Return a model as in a pipeline file: its tag, and the keys whose values differ from their defaults."""
+    """Return a model as plain data for a pipeline file: its tag, and the keys whose values are not the defaults."""
     values = default.model_dump(mode="json", exclude_defaults=True)
     return {**{name: getattr(default, name) for name in TAGS if hasattr(default, name)}, **values}
 

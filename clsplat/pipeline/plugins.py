@@ -1,4 +1,4 @@
-"""Import plug-ins: losses, rules, filters, stages, readers, and more from outside the package.
+"""Import plug-ins: losses, rules, filters, stages, readers, and other classes from outside the package.
 
 A plug-in is a Python file, given by `--plugin FILE.py`, or a module that an installed package names in the entry-point
 group `clsplat.plugins`.  Once it is imported, its classes can be used.  Its kernels are files next to it, which may
@@ -95,7 +95,7 @@ def used_by(kinds: Collection[type]) -> dict[str, str]:
 def require(digests: Mapping[str, str], source: str) -> None:
     """Raise ConfigError if a recorded plug-in is not loaded or has changed.
 
-    digests: content hashes by name.  source: the file that contains them.
+    digests: content hashes by name of the plug-in.  source: the file that contains the hashes.
     """
     if faults := differences(digests):
         raise ConfigError(f"{source}: {faults[0]}")
@@ -144,7 +144,7 @@ def _load_entry(entry: EntryPoint) -> Plugin:
 
 @contextmanager
 def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
-    """Yield a list to which the classes that the block defines are added at its end.
+    """Yield a list.  When the block ends, add the classes that it defined to the list.
 
     If the block fails or two classes have the same name, remove everything that the block defined, and raise
     ConfigError.  Every exception except KeyboardInterrupt is converted.
@@ -223,7 +223,7 @@ def _imports(module: ModuleType) -> list[ModuleType]:
 
 
 def _locate(module: str, path: Path | None, error: BaseException) -> str:
-    """Return the file and line of a failure: the last in the plug-in, else the last outside the import system."""
+    """Return the file and line of a failure: the innermost frame in the plug-in, else outside of the import system."""
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{error.filename}:{error.lineno}"
     frames = [

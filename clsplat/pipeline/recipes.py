@@ -45,7 +45,7 @@ def summaries_text(pipelines: list[dict[str, str]]) -> str:
 
 
 def manual(name: str) -> dict[str, Any]:
-    """Return the name, summary, path, and stages of a pipeline, and its keys for --set with values and descriptions.
+    """Return a pipeline's name, summary, path, and stages, and its keys for --set with their values and descriptions.
 
     Raises ConfigError.
     """

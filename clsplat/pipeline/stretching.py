@@ -1,9 +1,9 @@
 """Stretch the schedules of a pipeline to another number of training steps.
 
-Steps, durations, and intervals are multiplied by one factor, so stages inside `during` act as often and in the same
-order as before, and stages that acted at the same step still do.  Intervals may become fractional.  If two actions then
-fall on one step, they happen in the order of the list.  Learning rates of parameters that are learned over the entire
-training, such as a filter, are divided by the factor.
+Steps, durations, and intervals are multiplied by one factor.  Stages inside `during` therefore act as often and in the
+same order as before, and stages that acted at the same step still do.  Intervals may become fractional.  If two actions
+then fall on one step, they happen in the order of the list.  Learning rates of parameters that are learned over the
+entire training, such as those of a filter, are divided by the factor.
 """
 
 import math
@@ -33,11 +33,11 @@ class Axis:
     exact: Fraction
     """Factor of the number of steps."""
     factor: Fraction
-    """Factor of all other steps: the next multiple of 1 / PARTS."""
+    """Factor of all other steps: `exact`, rounded up to a multiple of 1 / PARTS."""
 
     @classmethod
     def from_factor(cls, factor: float | Fraction) -> "Axis":
-        """Return the axis of a factor; a float is read as its shortest decimal representation."""
+        """Return the axis with a factor; a float is converted by its shortest decimal representation."""
         exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
         return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))
 
@@ -54,7 +54,7 @@ class Axis:
         return int(interval) if interval.denominator == 1 else float(interval)
 
     def scale_start(self, start: int, every: float) -> int:
-        """Return the stretched `start`.  It excludes the same actions as before."""
+        """Return the stretched `start`, which excludes the same actions as before."""
         number = count_fired(every, start)
         return max(
             0, min(max(self.scale(start), self._action_step(every, number)), self._action_step(every, number + 1) - 1)
@@ -80,7 +80,7 @@ class Axis:
 
 
 def with_steps(settings: PipelineFile, steps: int, done_steps: int) -> PipelineFile:
-    """Return settings with another number of training steps, without changing the first `done_steps`.
+    """Return settings with another number of training steps.  The first `done_steps` do not change.
 
     If `steps` is larger than the last edit, the steps up to that edit do not change either.  Stages that start later
     start at the same fraction of the remaining steps.
@@ -97,9 +97,9 @@ def with_steps(settings: PipelineFile, steps: int, done_steps: int) -> PipelineF
 
 
 def last_edit(training: Training) -> int:
-    """Return the last step at which Gaussians are added or the size of photos changes; 0 if no setting limits it.
+    """Return the last step at which Gaussians are added or the size of photos changes; 0 if no setting limits them.
 
-    A shorter training would end with small photos, or before its last pruning.
+    A shorter training would end with downscaled photos, or before its last pruning.
     """
     stops = [stage.stop for stage in training.during if isinstance(stage, Densify) and stage.stop is not None]
     return max([0, *stops, *([int(training.views.last_change)] if isinstance(training, Optimize) else [])])
@@ -121,7 +121,7 @@ def min_steps(training: Training) -> int:
 
 
 def stretch_to_steps(settings: PipelineFile, steps: int) -> PipelineFile:
-    """Return settings stretched so that the first training has `steps` steps.  Raises ConfigError without training."""
+    """Return settings stretched to `steps` steps of the first training.  Raises ConfigError if no stage trains."""
     return stretch(settings, Fraction(steps, settings.training.steps))
 
 
@@ -137,13 +137,13 @@ def _stretch_stage(stage: Scheduled, pivot: int, factor: float) -> Scheduled:
 
 
 def map_trainings(settings: PipelineFile, kind: type[Kind], change: Callable[[Kind], Kind]) -> PipelineFile:
-    """Return settings with each training stage of a kind replaced by the result of `change`."""
+    """Return settings with `change` applied to each training stage of a kind."""
     stages = [change(stage) if isinstance(stage, kind) else stage for stage in settings.stages]
     return settings.model_copy(update={"stages": stages})
 
 
 def stretch(value: Value, factor: float | Fraction) -> Value:
-    """Return settings for `factor` times as many steps, with the `step_keys` of each class scaled."""
+    """Return settings for `factor` times as many steps; the `step_keys` of each class are scaled."""
     return _stretch(value, Axis.from_factor(factor))  # type: ignore[no-any-return]
 
 

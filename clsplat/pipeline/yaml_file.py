@@ -229,7 +229,7 @@ class _Reader:
         return data
 
     def _merge(self, node: Node, key_path: KeyPath) -> dict[str, Any]:
-        """Return the map to which `<<` refers; the lines of keys that the outer map also has do not change."""
+        """Return the map to which `<<` refers.  Keys that the outer map also has keep their line numbers."""
         if not isinstance(node, MappingNode):
             raise _BadValue(node, "expected a map after '<<'")
         outer_lines, self._lines = self._lines, {}

@@ -56,7 +56,7 @@ class PlannedStep:
 
 
 def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
-    """Plan the steps for the photographs in `source`: each step's folder below `root`, and any reason to run it.
+    """Return the steps for the photographs in `source`, each with its folder below `root` and any reason to run it.
 
     Raises DataError when the photographs cannot be read.
     """
@@ -101,7 +101,7 @@ def prepare(
 
 @contextmanager
 def _lock_result(planned_step: PlannedStep) -> Iterator[None]:
-    """Lock the result of a step for the block, so that only one process computes it."""
+    """Lock the result of a step during the block, so that only one process computes it."""
     with raising_output_error(planned_step.folder.parent):
         make_folder(planned_step.folder.parent)
     with lock.lock_folder(planned_step.folder, planned_step.folder.with_name(f".{planned_step.folder.name}.lock")):
@@ -111,7 +111,7 @@ def _lock_result(planned_step: PlannedStep) -> Iterator[None]:
 def fingerprint(folder: Path, excluded_folder: Path) -> str:
     """Return a hash of the names and contents of the files below a folder.
 
-    Hidden files and folders, and files in `excluded_folder`, are not part of it.
+    Hidden files and folders, and files in `excluded_folder`, do not affect the hash.
     Raises DataError when the folder does not exist, or when a file in it cannot be read.
     """
     require_folder(folder)
@@ -127,12 +127,12 @@ def fingerprint(folder: Path, excluded_folder: Path) -> str:
 
 
 def make_note(steps: Sequence[PlannedStep]) -> dict[str, str]:
-    """Return the note for a run folder: the hash of the prepared photographs, and their folder."""
+    """Return the record of the preparation for a run folder: the hash of the prepared photographs, and their folder."""
     return {"inputs": steps[-1].key, "folder": str(steps[-1].folder)}
 
 
 def read_note(out: Path) -> dict[str, str] | None:
-    """Return the note of a run folder.  None if it is missing or damaged."""
+    """Return the record that `make_note` made for a run folder.  None if it is missing or damaged."""
     try:
         summary = read_json(out / PREPARE_SUMMARY)
         return {"inputs": str(summary["inputs"]), "folder": str(summary["folder"])}
@@ -220,7 +220,7 @@ def _find_fault(folder: Path) -> str:
 
 
 def _reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """Return why a step must run: its result is damaged, or differs from the newest one.  "" if the result is valid."""
+    """Return why a step must run: its result is damaged, or what changed since the newest result; "" if it need not."""
     if folder.exists():
         fault = _find_fault(folder)
         return fault and f"{fault}; the result is recomputed"
@@ -246,7 +246,7 @@ INTERNAL = ("origin", "inputs", "settings", "files")  # keys of a record that ar
 
 
 def read_statistics(planned: Sequence[PlannedStep]) -> dict[str, dict[str, Any]]:
-    """Return the statistics of each step, by the name of the step, without steps whose results were removed."""
+    """Return the statistics of each step, by the name of the step.  Steps whose results were removed are omitted."""
     records = {planned_step.step.stage: read_record(planned_step.folder) for planned_step in planned}
     return {
         stage: {key: value for key, value in record.items() if key not in INTERNAL}

@@ -40,7 +40,7 @@ def require_pycolmap() -> ModuleType:
 
 @contextmanager
 def open_database(pycolmap: ModuleType, database: Path) -> Iterator[Any]:
-    """Open a COLMAP database for the block, and create it if it does not exist."""
+    """Open a COLMAP database during the block, and create it if it does not exist."""
     db = pycolmap.Database.open(str(database))
     try:
         yield db

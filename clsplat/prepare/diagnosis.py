@@ -103,7 +103,7 @@ def _describe_groups(graph: MatchGraph, groups: Sequence[list[str]]) -> str:
 
 
 def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str, str]:
-    """Return the photographs that are not in the first model, by name, with the likely reason.
+    """Return the likely reason why each photograph is missing from the first model, by the name of the photograph.
 
     models: the names of the photographs in each model, the largest model first.
     """

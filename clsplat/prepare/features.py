@@ -1,7 +1,7 @@
 """Find SIFT features of photographs (Lowe 2004) with OpenCV, and store them in COLMAP's database.
 
 Images are stored in order of their names, so the same photographs always produce the same database.  The features of
-each photograph are written in one transaction, so a run after a kill continues with the next photograph.
+each photograph are written in one transaction, so a run that was killed resumes at the next photograph.
 """
 
 import logging
@@ -59,7 +59,7 @@ def find_features(
     """Find the features of the photographs in a folder, and write a COLMAP database in the folder `out`.
 
     Returns the number of photographs, the number of cameras, and a dict from the names of unreadable photographs to the
-    reasons.  Photographs with an EXIF rotation are copied upright, others are linked.  With `cameras: auto`,
+    reasons.  Photographs with an EXIF rotation are copied upright; others are linked.  With `cameras: auto`,
     photographs of the same size share a camera if EXIF names the same lens for them, or no lens.  Raises DataError
     when fewer than three photographs can be read.
     """

@@ -58,11 +58,12 @@ class Pairing:
 def match_features(
     source: Path, out: Path, matching: Matching = "auto", neighbors: int = 10, threads: int = 1
 ) -> dict[str, Any]:
-    """Match all pairs of photographs, or each photograph with the `neighbors` next ones by name or by similarity.
+    """Match all pairs of photographs, or each photograph with the `neighbors` next by name or the `neighbors` most
+    similar.
 
     `auto` matches all pairs of up to 200 photographs; for more, each photograph with the most similar ones.  Returns
     the method that was used, and the number of pairs that match.  More than one thread is faster but not
-    bit-identical: in about one of a hundred calls of pycolmap 4.2, two pairs get different matches.
+    bit-identical: in about one in a hundred calls of pycolmap 4.2, two pairs get different matches.
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
@@ -128,10 +129,10 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
 
 
 def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
-    """Return pairs with at least one `unplaced` photograph that `match_database` has not matched.
+    """Return pairs that contain an `unplaced` photograph and that `match_database` has not matched.
 
-    They at most double the number of matched pairs: if there are more candidates, each unplaced photograph is paired
-    only with the most similar photographs, at least one.
+    The pairs at most double the number of matched pairs: if there are more candidates, each unplaced photograph is
+    paired only with the most similar photographs, at least one.
     """
     pycolmap = require_pycolmap()
     with open_database(pycolmap, database) as db:

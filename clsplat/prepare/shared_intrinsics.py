@@ -19,7 +19,7 @@ KEYS: dict[Cameras, Key] = {  # photographs of the same size share a camera if t
 
 
 def group_photos(images: Path, names: Sequence[str], cameras: Cameras) -> list[list[str]]:
-    """Return groups of photographs that share a camera, each sorted, in order of their first names.
+    """Return groups of photographs that share a camera, sorted by the first name in each; names in a group are sorted.
 
     Raises DataError when a photograph cannot be read.
     """

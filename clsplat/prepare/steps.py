@@ -74,13 +74,13 @@ class FindFeatures(Step):
     stage: Literal["find_features"] = "find_features"
 
     long_side: Positive = 1600
-    """Longer side in px of the images in which features are detected; larger photos are reduced."""
+    """Longer side in px of the images in which features are detected; larger photos are downscaled."""
     features: Positive = 12288
     """Maximum number of features per photo."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
     """COLMAP camera model; OPENCV_FISHEYE for fisheye lenses, EQUIRECTANGULAR for panoramas."""
     cameras: Cameras = "auto"
-    """Photos of the same size that share a camera; auto: those with the same lens in EXIF, or without a lens."""
+    """Photos of the same size that share a camera; auto: those with the same lens, or no lens, in EXIF."""
 
     def is_done_in(self, source: Path) -> bool:
         return is_scene(source)
@@ -115,7 +115,7 @@ class MatchFeatures(Step):
     matching: Matching = "auto"
     """Pairs of photos to match; auto: exhaustive, or vocabulary for more than 200 photos."""
     neighbors: Positive = 10
-    """Number of photos that each is matched with, unless matching is exhaustive."""
+    """Number of photos with which each photo is matched, unless matching is exhaustive."""
     threads: Positive = 1
     """Number of threads; more than one is faster, but results are not always bit-identical."""
 

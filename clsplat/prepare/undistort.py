@@ -1,4 +1,4 @@
-"""Convert a scene to pinhole cameras: undistort its photographs, and optionally reduce them."""
+"""Convert a scene to pinhole cameras: undistort its photographs, and optionally downscale them."""
 
 from collections import Counter
 from dataclasses import replace
@@ -25,9 +25,9 @@ def undistort_scene(
 ) -> int:
     """Write a COLMAP scene of pinhole cameras to the folder `out`, and return the number of its images.
 
-    Photographs larger than `long_side` px are reduced.  `undefined_pixels: crop` keeps the largest part of a photograph
-    without undefined pixels; `mask` keeps the entire photograph, and writes masks of its undefined pixels.  Images that
-    an earlier call made from the same photographs with the same settings stay unchanged.
+    Photographs larger than `long_side` px are downscaled.  `undefined_pixels: crop` keeps the largest part of a
+    photograph without undefined pixels; `mask` keeps the entire photograph, and writes masks of its undefined pixels.
+    Images that an earlier call made from the same photographs with the same settings stay unchanged.
     Raises DataError when the scene cannot be read, or when `out` contains other images.
     """
     scene = read_scene(source, holdout=0)
@@ -72,7 +72,7 @@ def _downscale(view: View, long_side: int | None) -> View:
 
 
 def _png_names(names: list[str]) -> list[str]:
-    """Return the names with the suffix .png.  If two names would be equal, it is appended to the original suffix."""
+    """Return the names with the suffix .png.  Equal results become the original names plus .png."""
     candidates = [Path(name).with_suffix(".png").as_posix() for name in names]
     counts = Counter(candidates)
     unique_names = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(candidates, names, strict=True)]

@@ -1,1 +1,1 @@
-"""Images of Gaussians: tile lists, projection, blending, filters, backgrounds."""
+"""Render images of Gaussians: tile lists, projection, blending, filters, and backgrounds."""

@@ -50,8 +50,9 @@ class Auto(Backdrop):
     """Learn a sky if the photographs show one.
 
     Before training, the photographs are searched for sky: smooth, bright or blue regions that touch the upper edge and
-    are far from all points of the dataset.  A photograph with more than a quarter of such pixels below the horizon
-    counts as a photograph without sky.  If no sky is chosen, the model is bit-identical to one without this key.
+    are far from all points of the dataset.  A photograph in which more than a quarter of such pixels are below the
+    horizon counts as a photograph without sky.  If no sky is chosen, the model is bit-identical to one without this
+    key.
     """
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
@@ -62,7 +63,7 @@ class Auto(Backdrop):
     share: Annotated[float, Field(gt=0, lt=1)] = 0.15
     """Fraction of the upper third of a photo that must be sky for the photo to count."""
     photographs: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Fraction of the photos that must count."""
+    """Fraction of the photos that must count for a sky to be learned."""
     chosen: Literal["on", "off"] | None = None
     """Written by a run: whether a sky is learned."""
     reason: str = ""

@@ -166,7 +166,7 @@ class BoxFilter(ScreenFilter):
     variance: Annotated[float, AfterValidator(_require_box_variance)] = BOX_VARIANCE
     """Variance of the box, px², for programs that use a Gaussian blur instead; it cannot be changed."""
     compensate: Literal[1] = 1
-    """A box keeps the energy of a splat; it cannot be changed."""
+    """1, since integration over the box keeps the energy of a splat; it cannot be changed."""
 
 
 class Motion(Settings):
@@ -199,13 +199,13 @@ class ModelSettings(Settings):
     """Smallest depth in scene units that is rendered; `auto`: 4% of the scene's extent, or half of the 1% quantile of
     the depths of observed points, if that is less.  A run writes the value."""
     near_auto: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] | None = None
-    """Written by a run: the value that `auto` chose.  While `near` equals it, other photos lead to a new choice."""
+    """Written by a run: the value that `auto` chose.  As long as `near` has this value, other photos change both."""
     world_filter: OneOf[WorldFilter] = NoWorldFilter()
     """Blur of Gaussians in the world."""
     screen_filter: OneOf[ScreenFilter] = Dilation()
     """Blur of splats in the image."""
     background: OneOf[Backdrop] | None = None
-    """Background behind the Gaussians: `envmap`, a learned sky, or `auto`; default: `scene.background`."""
+    """Background behind the Gaussians: `envmap` (a learned sky) or `auto`; default: `scene.background`."""
     time: Motion | None = None
     """Motion of Gaussians, in a scene whose views have times; default: they do not move."""
 

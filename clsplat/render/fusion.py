@@ -30,9 +30,9 @@ class DepthImage:
 
 
 def find_blocks(images: Iterable[DepthImage], voxel: float, truncation: float) -> Blocks:
-    """Return the blocks within the truncation of a surface that at least MIN_VIEWS views see, in ascending order.
+    """Return the blocks within `truncation` of a surface in at least MIN_VIEWS views, in ascending order.
 
-    Surfaces so far that a pixel covers more than MAX_PIXEL voxels are left out.  voxel, truncation: scene units
+    Surfaces so far away that a pixel covers more than MAX_PIXEL voxels are left out.  voxel, truncation: scene units.
     """
     keys = [np.zeros(0, np.int64)]
     for image in images:
@@ -46,9 +46,9 @@ def find_blocks(images: Iterable[DepthImage], voxel: float, truncation: float) -
 
 
 def _unproject(image: DepthImage, truncation: float, reach: float) -> NDArray[np.float64]:
-    """Return the points of every second pixel in each direction, and those before and behind the surface, [M, 3].
+    """Return points on, in front of, and behind the surface, [M, 3], for every second pixel in each direction.
 
-    reach: size of the largest pixel, scene units; farther points are left out.
+    reach: largest size of a pixel on the surface, in scene units; surfaces with larger pixels are left out.
     """
     camera, pose = image.view.camera, image.view.world_to_camera.astype(np.float64)
     pixels = image.depth[::2, ::2]
@@ -64,7 +64,7 @@ def _unproject(image: DepthImage, truncation: float, reach: float) -> NDArray[np
 
 @dataclass(frozen=True)
 class DistanceField:
-    """The distance to the surface at the grid points of blocks, with colors."""
+    """The distance to the surface and the color at each grid point of blocks."""
 
     blocks: Blocks
     voxel: float  # scene units
@@ -92,7 +92,7 @@ def fuse(
 def integrate(
     device: Device, images: Iterable[DepthImage], blocks: Blocks, voxel: float, truncation: float
 ) -> list[Array]:
-    """Return the sums of all images at the grid points of each CHUNK of blocks, [FIELDS, points]."""
+    """Return sums over all images at the grid points, as an array [FIELDS, points] for each chunk of CHUNK blocks."""
     kernels, parts = device.program("fusion.cl"), list(_chunks(device, blocks))
     sums = [device.zeros((FIELDS, count)) for _, count in parts]
     for image in images:
@@ -113,7 +113,7 @@ def integrate(
 
 
 def count_free(device: Device, images: Iterable[DepthImage], blocks: Blocks, voxel: float) -> NDArray[np.uint32]:
-    """Return the number of views that see each grid point of blocks in front of the surface, [B, SIDE, SIDE, SIDE]."""
+    """Return the number of views in which each grid point is in front of the surface, [B, SIDE, SIDE, SIDE]."""
     kernels, parts = device.program("fusion.cl"), list(_chunks(device, blocks))
     counts = [device.upload(np.zeros(count, np.uint32)) for _, count in parts]
     for image in images:

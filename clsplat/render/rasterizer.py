@@ -67,7 +67,10 @@ def sum_inverse_depths(
 
 
 def add_inverse_depth_gradient(workspace: Workspace, camera: DeviceCamera, splats: Array, grad_means: Array) -> None:
-    """Add the gradient through the inverse depth, from the last sums, to `grad_means`.  splats: [N, RECORD]."""
+    """Add the gradient through the inverse depth to `grad_means`.  splats: [N, RECORD].
+
+    Uses the sums of the last call of `sum_inverse_depths`.
+    """
     count, capacity = splats.shape[0], grad_means.shape[1]
     workspace.device.program("inverse_depth.cl").inverse_depth_backward(
         items=count,
@@ -234,7 +237,7 @@ class Rasterizer:
         """Render the model.  background: [3], used if the model has no sky.
 
         If the pairs of all tiles exceed the budget or the device's memory, the frame is rendered in bands of rows, with
-        the same bits.  Waits for the number of pairs.  Raises MemoryLimitError if a single row does not fit.
+        bit-identical results.  Waits for the number of pairs.  Raises MemoryLimitError if a single row does not fit.
         """
         while not self.is_complete(frame := self.start_forward(model, camera, background, content)):
             pass
@@ -320,7 +323,7 @@ class Rasterizer:
         return self.workspace.plans.run(key, {"camera": camera.array, "background": background}, blend)
 
     def _blend(self, content: Content, **defines: int) -> Program:
-        """Return the blending kernels for this content."""
+        """Return the blending kernels for the content of a frame, such as depth."""
         return self.device.program(f"blend_{self.device.schedule}.cl", **defines, **DEFINES.get(content, {}))
 
     def _split(self, camera: DeviceCamera) -> list[Band]:

@@ -113,7 +113,8 @@ class Tiler:
     ) -> TileLists:
         """Build the tile lists of `count` splats in a band.  Waits only if there is no room for pairs yet.
 
-        The lists are valid if `has_room` is true.  limit: largest room.  Raises TooManyPairs like `has_room`.
+        The lists are valid if `has_room` is true.  limit: maximum number of pairs.  Raises TooManyPairs
+        like `has_room`.
         """
         if self.sort == "auto":
             self.sort = self._measure_faster_sort(splats, footprints, band, count, limit, defines)
@@ -199,7 +200,7 @@ class Tiler:
         self._room = min(int(pairs * GROWTH), limit) if self._room else pairs
 
     def reset_room(self) -> None:
-        """Forget the room for pairs, so that the next lists get exactly what they need."""
+        """Forget the room for pairs, so that the next lists get exactly the room that they need."""
         self._room = 0
 
     def _pair_array(self, name: str, room: int) -> Array:
@@ -213,7 +214,7 @@ class Tiler:
         return {**arguments, "splats": splats, "tile_box": footprints.tile_box, "tile_count": footprints.tile_count}
 
     def scan(self, values: Array, count: int, name: str) -> Array:
-        """Return the exclusive prefix sum, [count + 1] with the total at the end."""
+        """Return the exclusive prefix sum of `count` values, [count + 1] with the total at the end."""
         offset = self.workspace.array(name, count + 1, np.uint32)
         if count == 0:
             offset.fill(0)

@@ -21,7 +21,7 @@ class Failures(dict[str, ClsplatError]):
 
     @contextmanager
     def recording(self, name: str) -> Iterator[None]:
-        """Record an error in the block as the failure of a part, instead of raising it.  Raises Interrupted."""
+        """Record an error in the block as the failure of a part, instead of raising it.  Interrupted is not caught."""
         try:
             yield
         except Interrupted:

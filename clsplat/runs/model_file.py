@@ -92,7 +92,7 @@ def _count_parameters(host_model: AnyModel) -> dict[str, int | None]:
 
 @dataclass(frozen=True)
 class ModelSource:
-    """A model file, and the dataset that it is rendered or compared with."""
+    """A model file, and the dataset at whose views the model is rendered and measured."""
 
     file: Path
     folder: Path  # dataset folder, with the photos and cameras
@@ -133,7 +133,7 @@ class ModelSource:
 
 
 def require_model(path: Path) -> None:
-    """Raise DataError if a path is a folder without a model of Gaussians, or a field."""
+    """Raise DataError if a path is a field file, or a folder without a model of Gaussians."""
     refuse_field(path)
     if path.is_dir() and not (file := model_path(path)).is_file():
         raise _missing_model_error(path, file.name)

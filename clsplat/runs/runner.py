@@ -55,7 +55,7 @@ def start_refit_if_due(run: Run) -> None:
 def with_refit_steps(pipeline: Pipeline, run: Run) -> Pipeline:
     """Return the pipeline to train: in a refit, with the number of steps that validation chose, else unchanged.
 
-    A refit has the same bits as a run of the returned pipeline without validation views.
+    A refit is bit-identical to a run of the returned pipeline without validation views.
     """
     if not run.is_refit or run.best is None:
         return pipeline

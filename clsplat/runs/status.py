@@ -131,7 +131,7 @@ def _format_numbers(record: dict[str, Any], names: tuple[str, ...]) -> str:
 
 
 def _process(status: dict[str, Any]) -> str:
-    """Return the host on which a run is executed, or its process if it is on this machine."""
+    """Return the host on which a run is executed, or its process ID if it is on this machine."""
     owner = Owner.from_record(status)
     is_remote = owner is not None and not owner.is_local
     return f"; it runs on {status.get('host')}" if is_remote else f"; process {status.get('process')}"

@@ -58,7 +58,7 @@ class Rehearsal:
         return math.floor(self.steps * math.pow(times, 1 / (1 + self.trend)))
 
     def later_step_times(self, fraction: float) -> tuple[float, float]:
-        """Return the mean and the final step time after a fraction of the training, relative to the step time there."""
+        """Return the mean and the final step time after a fraction of training, relative to the step time at that point."""
         index = min(int(fraction * len(self.step_times)), len(self.step_times) - 1)
         current = self.step_times[index]
         return fmean(self.step_times[index:]) / current, self.step_times[-1] / current
@@ -139,7 +139,7 @@ def _execute_until(
 
 
 def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, deadline: float) -> Rehearsal:
-    """Repeat the rehearsal with more steps until it takes a minimum fraction of the budget; return the last one.
+    """Repeat the rehearsal with more steps until it takes a minimum fraction of the budget.  Return the last rehearsal.
 
     The result includes the trend of step times.  deadline: on the clock of `time.perf_counter`, s.  Raises the errors
     of `rehearse`.

@@ -303,7 +303,7 @@ class Inspection:
 
     @property
     def next_step(self) -> str | None:
-        """Advice on finding the cameras of photographs.  None for datasets with cameras and unusable photographs."""
+        """Advice on finding the cameras of photographs.  None if the dataset has cameras or unusable photographs."""
         facts = self.facts
         if not facts.is_unplaced or any(finding.level == "error" for finding in self.findings):
             return None

@@ -66,7 +66,7 @@ def _draw_points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tu
 
 
 def _name_lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:
-    """Return the lists of the page: the title, up to MAX_NAMES names, and the total number of names."""
+    """Return the lists of names on the page, each with its title, up to MAX_NAMES names, and the total count."""
     facts, photographs = inspection.facts, inspection.facts.photos
     lists = {
         "registered but missing from disk": facts.missing,

@@ -1,1 +1,1 @@
-"""Serve a page that shows a run while it trains, to this machine only."""
+"""Serve a page that shows a run while it trains and is reachable only from this machine."""

@@ -54,7 +54,7 @@ class Live:
         )
 
     def close(self) -> None:
-        """Stop the server.  If a page is open, wait for a moment until it has received the end of the run."""
+        """Stop the server.  If a page is open, first wait briefly until it has been notified of the end."""
         state = self.state
         state.set_paused(False)
         state.has_ended = True

@@ -278,7 +278,7 @@ class Curves:
         self._thin_history()
 
     def after(self, step: int) -> list[Point]:
-        """Return the points after a step."""
+        """Return the points at steps greater than `step`."""
         return [point for point in list(self._points) if point[0] > step]
 
     def _thin_history(self) -> None:
