@@ -58,7 +58,7 @@ class Rehearsal:
         return math.floor(self.steps * math.pow(times, 1 / (1 + self.trend)))
 
     def later_step_times(self, fraction: float) -> tuple[float, float]:
-        """Return the mean and the final step time after a fraction of training, relative to the step time at that point."""
+        """Return the mean and final step time after a fraction of training, relative to the step time at that point."""
         index = min(int(fraction * len(self.step_times)), len(self.step_times) - 1)
         current = self.step_times[index]
         return fmean(self.step_times[index:]) / current, self.step_times[-1] / current
