@@ -55,7 +55,7 @@ def to_path(value: PathLike | None) -> Path | None:
 def layer_names(depth: bool | str, normals: bool, alpha: bool) -> tuple[str, ...]:
     """Return the names of the layers to render: "color", and others if requested.  Raises ConfigError.
 
-    depth: "mean" or True, or "median"
+    depth: True or "mean" for the mean depth; "median" for the median depth
     """
     depths = {False: None, True: "depth", "mean": "depth", "median": "median_depth"}
     if depth not in depths:

@@ -43,7 +43,7 @@ def run(
     start: "resume" continues from the newest checkpoint in `out`, if there is one; "restart" removes the checkpoints
         and metrics of an existing run in `out` and starts over
     live: port of a web page on this machine that shows the model while it trains; 0 selects the default port
-    minutes: choose the number of steps so that the run takes this time, measured from when it reads the photos
+    minutes: choose the number of steps so that the run takes this many minutes, from the start of reading the photos
     on: an execution file, which specifies where the cells of a matrix run; it replaces the matrix's `execution`
     """
     return run_job(_job(pipeline, scene, out, set, start, on), device, live, minutes)
@@ -102,11 +102,11 @@ def status(folder: PathLike) -> dict[str, Any]:
 
     A run has the keys of status.json, its last report as `last`, and its `metrics`.  A matrix has `cells`, `done`, and
     `failed` instead of a step.  An unfinished run also has `silent`, the seconds since its last heartbeat, and `ahead`,
-    the seconds by which that heartbeat is in the future, if it is at least a minute.  Its state is "killed" if the
-    process no longer exists.  `advice` says how to continue.
+    the seconds by which that heartbeat is in the future, if at least 60.  Its state is "killed" if
+    the process no longer exists.  `advice` says how to continue.
 
-    The store of a sweep has `cells`, the `counts` of cells by state, and `events`.  A scene that is trained in blocks
-    has `state` and `parts`.
+    A store has `cells`, the `counts` of cells by state, and `events`.  A scene that is trained in blocks has
+    `state` and `parts`.
     """
     from clsplat.workflows.folder import read_status
 
@@ -125,7 +125,8 @@ def check(pipeline: PathLike) -> dict[str, Any]:
 
     The keys of the result depend on what is checked:
 
-    - A pipeline or a matrix: `path`, `name`, `stages` or `cells`, and `adapts`, keys whose values depend on the photos.
+    - A pipeline or a matrix: `path`, `name`, `stages` or `cells`, and `adapts` (the keys whose values depend on the
+      photos).
     - A run folder, or the folder of a scene in blocks: `whole` (whether all files are intact), `state`, and `objects`,
       a list of files, each with `whole` and a `detail`.
     - A model file: `format`, `ranges`, `bounds`, the counts of `degenerate` Gaussians, `findings`, and `valid`.
@@ -156,7 +157,7 @@ def pipelines(name: PathLike | None = None) -> Any:
 
 
 def find_variant(name: PathLike, key: Literal["short", "draft", "high"]) -> str:
-    """Return the name or path of a variant of a pipeline, such as `photos_high`.  Raises ConfigError if it has none."""
+    """Return the name or path of a pipeline's variant, such as `photos_high`.  Raises ConfigError if there is none."""
     from clsplat.pipeline import files
 
     return files.variant_name(str(name), key)
@@ -253,7 +254,7 @@ def compress_model(
     target: the limit, such as "-0.1dB" (of PSNR) or "5MB"
     out: folder for the file, a page about the search, and all trials
     format: the file format
-    keep: fractions of the Gaussians to try
+    keep: the fractions of the Gaussians that the trials keep; default: six fractions from 0.18 to 1
     steps: training steps after each pruning, 1000 by default; each palette is trained for a fifth of these steps
 
     Returns the content of compress.json, with `file` and `page`.  Raises ConfigError for a target that no file meets.
@@ -279,7 +280,7 @@ def write_levels(
     downscale: float | None = None,
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Write a model in levels of detail, as streamed SOG (lod-meta.json).
+    """Write a model at several levels of detail, as streamed SOG (lod-meta.json).
 
     model, scene: as for `render_views`; without a scene, no level is trained, and `steps`, `downscale`, and `device`
         raise ConfigError
@@ -314,9 +315,10 @@ def write_mesh(
 
     model, scene, downscale: as for `render_views`; the depths of the training views are fused
     file: a .ply, .obj, or .glb file
-    voxel: the resolution, in scene units; default: 1.2 pixels at the median depth
+    voxel: the edge length of a voxel, in scene units; default: 1.2 pixels at the median depth
     keep: reduce the mesh to this fraction of its faces; this requires the extra `mesh`
-    collision: write the closed hull of everything that no two views see as free, with twice this voxel by default
+    collision: write a hull for collisions instead, the closed surface around all space that no two views see as free;
+        the default voxel is then twice as large
 
     Returns `file`, `bytes`, the numbers of `vertices` and `faces`, the `voxel`, and whether the surface is `closed`.
     Raises DataError for a moving model, a field, or a model without an opaque surface.
@@ -412,7 +414,7 @@ def run_cell(
 
 
 def cancel(store: PathLike, cell: str | None = None) -> str:
-    """Request that running cells of a store save their state and stop: all cells, or the cell with a name or key.
+    """Request that all running cells of a store, or the cell with this name or key, save their state and stop.
 
     Returns the key of the cell, or "all".
     """
@@ -430,7 +432,7 @@ def run_worker(
 ) -> None:
     """Run cells from a scheduler on the devices of this machine until the scheduler exits.
 
-    scheduler: its address, dask://HOST:PORT or tls://HOST:PORT
+    scheduler: the address of the scheduler, dask://HOST:PORT or tls://HOST:PORT
     devices: names of devices; default: all working devices
     tls: paths of the CA certificate, the certificate, and its private key
     insecure: allow a connection without TLS
@@ -473,7 +475,7 @@ def convert(
     time: write a moving model as a static model at this time, in [0, 1]
     frames: write this number of static files at evenly spaced times: PLY files in the folder `out`, or files named
         `out` with a number added
-    world: write world coordinates instead of an origin
+    world: write world coordinates, not coordinates relative to an origin
     """
     from clsplat.gaussians import conversion
     from clsplat.gaussians.conversion import check_time, convert_frames
@@ -513,9 +515,9 @@ def align(
     """Give a scene or a model a known scale, up direction, or position, as `clsplat align` does.
 
     path: a dataset folder, a model file, or a run folder
-    out: a model file, or a folder for the cameras of the scene in this `format`, with a copy of the photos or without
+    out: a model file; for a dataset, a folder for its cameras in this `format`, with the photos if `images` is "copy"
     scene: the dataset of a model file
-    level: where the up direction comes from, which becomes -y
+    level: the source of the up direction, cameras or ground; up becomes -y
     distances: such as "A;B=1.25", where A and B are "x,y,z", "PHOTO:u,v+PHOTO:u,v", or names in the control file
     gps: use the GPS positions in the EXIF data of the photos; coordinates become UTM, and z points up
     control: a CSV file of points in photos, with the columns point, x, y, z, photo, u, and v

@@ -88,7 +88,7 @@ class RenderResult:
     def backward(
         self, image: Floats | None = None, alpha: Floats | None = None, depth: Floats | None = None
     ) -> Gradients:
-        """Return the gradients of a loss with respect to all parameters, and to the camera's pose and focal length.
+        """Return the gradients of a loss with respect to all parameters and the camera's pose and focal length.
 
         image: dL/d image, [height, width, 3]
         alpha: dL/d alpha, [height, width]
@@ -261,7 +261,7 @@ class FieldRenderer:
     """Renders a field on a device.  Threads may share a renderer, which renders one image at a time."""
 
     def __init__(self, model: FieldModel, device: str | Device | None = None) -> None:
-        """Copy a field to a device: an open one, one with this name, or by default `default_device()`.
+        """Copy a field to `device`: an open Device, or part of a name; default: `default_device()`.
 
         Raises DeviceError if no device is found, or if its results are wrong.
         """

@@ -38,9 +38,9 @@ def render_views(
     scene: a dataset folder; default: the dataset of the run
     downscale: divisor of the image size; default: the downscale factor of the run, or 1 for a model file
     kind: "png" writes 8-bit images, "npy" float32 arrays, [height, width, 3]
-    depth: also write NAME_depth, the mean depth (True or "mean"), or NAME_median_depth, the depth where transmittance
-        falls below ½ ("median"; 0: nowhere), in scene units, as arrays [height, width]
-    normals: also write NAME_normals, from the mean depth, in scene axes, as arrays [height, width, 3]; 0: unknown
+    depth: True or "mean" also writes NAME_depth, the mean depth; "median" also writes NAME_median_depth, the depth at
+        which the transmittance falls below ½, or 0 if it stays above; in scene units, as arrays [height, width]
+    normals: also write NAME_normals, from the mean depth, in scene axes, as arrays [height, width, 3]; 0 where unknown
     alpha: also write NAME_alpha, in [0, 1], as arrays [height, width]
     time: render a moving model at this time, in [0, 1], instead of at the times of the views
     """
@@ -86,12 +86,13 @@ def render_path(
     size: width and height, which must be even; default: the image size divided by `downscale`
     times: for a moving model, one time in [0, 1], or the times of the first and last frame, such as (0, 1) or "0..1";
         default: the full range, or the times of the views
-    side: what to show in the right half: "photograph", the photo with the nearest camera, or another model
+    side: what the right half shows: "photograph" for the photo of the nearest camera, or the path of another model
     depth, normals, alpha: also write videos of these layers, as in `render_views`
 
     Raises ConfigError for a value out of range, a missing scene, or a file that must not be replaced; DataError for an
     unreadable file, or a path that the cameras do not permit; NumericError for images that are not finite; OutputError
-    for a file that cannot be written; DeviceError and MemoryLimitError for a device.
+    for a file that cannot be written; DeviceError for a device that does not work, and MemoryLimitError for one with
+    too little memory.
     """
     from clsplat.runs import video as videos
     from clsplat.viewer.video.plan import VideoRequest

@@ -18,7 +18,7 @@ ScheduleName = Literal["auto", "wide", "simt"]  # wide for CPUs, simt for GPUs
 
 
 def devices() -> list[dict[str, Any]]:
-    """Return the OpenCL devices, each with name, limits (bytes and work items), `schedule`, and `fault`.
+    """Return the OpenCL devices, each with its name, limits (bytes and work items), `schedule`, and `fault`.
 
     `fault` is the reason why a device does not work, or None.  Each device is tested once, in a separate process.
     """
@@ -85,7 +85,7 @@ def measure_speed(
 
     scenes: any of the fixed scenes A, B, and C
     model, scene: a splat file or point cloud and its dataset, which are timed as well
-    pipeline: defines the losses, statistics, and filters
+    pipeline: the pipeline whose losses, statistics, and filters are used
     repeats: number of steps per scene
     """
     from clsplat.conformance.bench.measurement import measure

@@ -60,10 +60,10 @@ class Report:
 class Trainer:
     """Trains a scene with a pipeline.  The result is bit-identical to that of `clsplat run`.
 
-    Stages before the training run in the constructor, and later stages that edit the model run with the last step.
-    Other stages, such as `evaluate` and `export`, do not run; use the method `evaluate` and the property `model`.
-    Ctrl-C takes effect after the current step, and training can continue.  Threads may share a trainer; their calls
-    run one at a time.
+    Stages before the training run in the constructor, and later stages that edit the model run at the end of the last
+    step.  Other stages, such as `evaluate` and `export`, do not run; use the method `evaluate` and the property
+    `model`.  Ctrl-C takes effect after the current step, and training can continue.  Threads may share a trainer; their
+    calls run one at a time.
     """
 
     def __init__(
@@ -186,7 +186,7 @@ class Trainer:
             step_count += 1
 
     def run(self, count: int | None = None) -> Report | None:
-        """Train for `count` steps, or to the end of the training; return the last report, or None without steps."""
+        """Train for `count` steps, or to the end of the training; return the last report, or None if no step ran."""
         report = None
         for report in self.steps(count):  # noqa: B007
             pass
@@ -195,7 +195,7 @@ class Trainer:
     @property
     @serialized
     def model(self) -> Model:
-        """A copy of the current model.  `model.baked()` bakes in its world filter, as a run does for its files."""
+        """A copy of the current model.  `model.baked()` bakes in the 3D filter, as for the files of a run."""
         return host_model(self._run)
 
     @serialized
@@ -225,10 +225,10 @@ class Trainer:
 
     @serialized
     def checkpoint(self) -> Path:
-        """Save a checkpoint and return its file.  Training that resumes from it yields the same bits.
+        """Save a checkpoint and return its file.
 
-        Losses from `add_loss` are not saved.  The newest two checkpoints are kept in `out`.  Raises OutputError if the
-        file cannot be written.
+        Training that resumes from it is bit-identical to uninterrupted training.  Losses from `add_loss` are not saved.
+        The newest two checkpoints are kept in `out`.  Raises OutputError if the file cannot be written.
         """
         with nullcontext() if self._state == "open" else lock.lock_folder(self.out):
             return checkpoint.save(self._run, keep=2)

@@ -64,7 +64,7 @@ def video(
         bool, typer.Option("--times", help="For a dynamic scene: also write times.json, the time of each frame.")
     ] = False,
 ) -> None:
-    """Extract sharp frames from a video, with the same motion between them."""
+    """Extract sharp frames from a video, with equal camera motion between them."""
     from clsplat.data_tools.video import write_frames
 
     print(f"{write_frames(file, out, frames, long_side, times)} frames in {out}")

@@ -307,7 +307,7 @@ def lod(
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Write a model in levels of detail for the web (streamed SOG).  With photos, each level is trained."""
+    """Write a model at several levels of detail for the web (streamed SOG).  With photos, train each level."""
     from clsplat.workflows.lod import table
 
     result = commands.write_levels(

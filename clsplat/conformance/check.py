@@ -69,7 +69,7 @@ def match(kernel: str, label: str, value: NDArray[Any], expected: NDArray[Any] |
 
 
 def count_true(kernel: str, label: str, mask: NDArray[Any], limit: float = 0) -> Deviation:
-    """Count the True values of a mask; up to `limit` pass."""
+    """Count the True values of a mask; the check passes if there are at most `limit`."""
     return Deviation(kernel, label, float(np.count_nonzero(mask)), limit, counts=True)
 
 

@@ -64,7 +64,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
 
 
 def remember(info: DeviceInfo, schedule: FixedSchedule, sorts: Sequence[str] = SORTS) -> None:
-    """Record that a device computes correctly.  If the cache cannot be written, the next run checks it again."""
+    """Record that a device computes correctly.  If the cache is not writable, the next run checks the device again."""
     with suppress(OutputError):
         for sort in sorts:
             write_text(_record_file(info, schedule, sort), f"{info.text}, {schedule}, {sort}\n")

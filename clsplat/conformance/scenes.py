@@ -23,7 +23,7 @@ POSE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0
 
 @dataclass(frozen=True)
 class Case:
-    """N Gaussians in front of a camera.  Values are float32, so that kernels and reference use the same ones."""
+    """N Gaussians in front of a camera.  Values are float32, so that kernels and reference use the same values."""
 
     parameters: dict[str, NDArray[Any]]  # [N, components] float32
     view: View

@@ -148,7 +148,7 @@ def pluralize(count: int, word: str) -> str:
 
 
 def size_text(gaussians: int | None, parameters: int | None, sky: int = 0) -> str:
-    """Format the size of a trained model: the number of Gaussians and `sky` Gaussians, or of a field's parameters."""
+    """Format the size of a model: the numbers of Gaussians and of `sky` Gaussians, or of the parameters of a field."""
     text = f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
     return f"{text} and {sky:,} of the sky" if sky else text
 

@@ -31,8 +31,9 @@ def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
 def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean of the basis functions Y(d), [K], over a distribution of directions d.
 
-    `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  Products of two functions of bands 1 to 3 span all of
-    these functions.  Products of only band 1 do not, so the result is then 0.
+    `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  Products of two functions of bands 1 to 3 span all
+    functions of these bands.  Products of two functions of band 1 do not span band 1, so with that band alone the
+    result is 0.
     """
     count, directions = len(form), _directions()
     values = basis(np.concatenate([directions, -directions]))[:, :count]

@@ -88,7 +88,7 @@ def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[
 
 
 def _heartbeat(path: Path) -> float | None:
-    """Return the time of a run's last status, in seconds since 1970.  None if it has no status, or has ended.
+    """Return the time of a run's last status, in seconds since 1970; None if the run has no status or has ended.
 
     The status is in the same folder as `path`, the lock file.
     """
@@ -136,7 +136,7 @@ def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[],
     """Lock a folder during the block, with the lock file `path`, by default `run.lock` inside.
 
     Yields a function that raises OutputError if that file was removed or replaced, since another process may then use
-    the folder.  Raises OutputError, with process and host, if another process holds the lock.
+    the folder.  Raises OutputError, which names the process and host, if another process holds the lock.
     """
     path = _resolve(folder, path or folder / LOCK)
     with _reserve(path, folder):

@@ -264,7 +264,7 @@ CONTAINER = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int | None:
-    """Return the free host memory in bytes, without swapping and within a container's limit; None if unknown."""
+    """Return the free host memory in bytes, excluding swap space, within a container's limit; None if unknown."""
     limits: list[int] = []
     with suppress(OSError, ValueError):
         lines = Path("/proc/meminfo").read_text("utf-8").splitlines()

@@ -1,4 +1,4 @@
-"""Record which files in a folder a tool wrote and from which sources, to resume calls and to protect users' files."""
+"""Record which files a tool wrote and from which sources, to resume interrupted calls and to protect users' files."""
 
 import hashlib
 import json

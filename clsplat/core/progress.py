@@ -20,7 +20,7 @@ MAX_POLLS = 40  # longer intervals keep polls below this number, since a poll ma
 
 
 class Listener(Protocol):
-    """A function that is called with a label, the number of finished items, the total, and the time left, if known."""
+    """A function called with a label, the number of finished items, the total, and the seconds left, if known."""
 
     def __call__(self, label: str, done: int, total: int, /, *, seconds_left: float | None) -> None: ...
 

@@ -31,7 +31,7 @@ STARTS = (  # the first bytes of unexpected content, its description, and a reme
 
 
 def require_content(path: Path, data: bytes, error_type: type[ClsplatError] = DataError) -> None:
-    """Raise `error_type` if a file that starts with `data` is empty or a failed download."""
+    """Raise `error_type` if a file that starts with `data` is empty or is the result of a failed download."""
     if not data:
         raise error_type(f"{path}: the file is empty; copy or export it again")
     for start, content, remedy in STARTS:
@@ -57,7 +57,7 @@ def open_file(
 def read_file(
     path: Path, description: str = "a file", error_type: type[ClsplatError] = DataError, limit: int | None = None
 ) -> bytes:
-    """Return the bytes of a regular file.  Raises DataError or `error_type`, as `open_file` does."""
+    """Return the bytes of a regular file.  Raises `error_type`, as `open_file` does."""
     with open_file(path, description, error_type, limit) as file:
         return file.read()
 
@@ -65,7 +65,7 @@ def read_file(
 def read_text(
     path: Path, description: str = "a text file", error_type: type[ClsplatError] = DataError, limit: int | None = None
 ) -> str:
-    """Return the UTF-8 text of a regular file.  Raises DataError or `error_type`, with the line of invalid bytes."""
+    """Return the UTF-8 text of a regular file.  Raises `error_type`, with the line number of an invalid byte."""
     try:
         return read_file(path, description, error_type, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -74,7 +74,7 @@ def read_text(
 
 
 def sha256(path: Path, description: str = "a file", error_type: type[ClsplatError] = DataError) -> str:
-    """Return the SHA-256 of a regular file, as `sha256sum` prints it.  Raises DataError or `error_type`."""
+    """Return the SHA-256 of a regular file, as `sha256sum` prints it.  Raises `error_type`."""
     with open_file(path, description, error_type) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -82,7 +82,7 @@ def sha256(path: Path, description: str = "a file", error_type: type[ClsplatErro
 def read_json(
     path: Path, description: str = "a JSON file", error_type: type[ClsplatError] = DataError, limit: int = MAX_JSON
 ) -> Any:
-    """Return the content of a JSON file.  Raises DataError or `error_type` if it cannot be read or parsed."""
+    """Return the content of a JSON file.  Raises `error_type` if it cannot be read or parsed."""
     data = read_file(path, description, error_type, limit)
     try:
         return json.loads(data)

@@ -91,7 +91,7 @@ class Points(Curve):
 
 
 class Decay(Curve):
-    """A value that decays or grows exponentially, as the learning rates of Kerbl et al. 2023."""
+    """A value that decays or grows exponentially, like the learning rates of Kerbl et al. 2023."""
 
     step_keys: ClassVar[frozenset[str]] = frozenset({"over", "start"})
 
@@ -226,5 +226,5 @@ def fire_steps(every: float, start: int, stop: int) -> list[int]:
 
 @lru_cache(maxsize=1024)
 def _ratio(every: float) -> tuple[int, int]:
-    """Return the interval, in decimal notation, as an exact ratio, so that events at the same step stay together."""
+    """Return an interval as an exact ratio of integers: 0.1, which float64 cannot represent, is 1 / 10."""
     return Fraction(str(every)).as_integer_ratio()

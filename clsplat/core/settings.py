@@ -48,7 +48,7 @@ class Settings(BaseModel):
     family: ClassVar[str] = ""  # another name, next to its type, that `conflicts` may use
     unavailable: ClassVar[Mapping[str, str]] = {}  # unknown keys that other settings have, each with advice
     conflicts: ClassVar[Mapping[str, str]] = {}
-    """Types or families that exclude this one, in the same stage or outside of stages: `reason; advice`."""
+    """Types or families that exclude this one, in the same stage or outside of stages, each with `reason; advice`."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
@@ -128,7 +128,7 @@ def variant_tag(kind: type[Settings]) -> tuple[str, str] | None:
 
 
 def resume_effect(kind: type[Settings], key: str) -> Literal["output", "training"] | None:
-    """Return what a change of a key on resume affects, or None if the key may not change."""
+    """Return what a change of a key's value on resume affects, or None if the value may not change."""
     bases = [base for base in kind.__mro__ if issubclass(base, Settings)]
     if any(key in base.output_keys for base in bases):
         return "output"
@@ -228,7 +228,7 @@ InputPath = Annotated[str, AfterValidator(_check_path)]  # an input file or fold
 
 
 def is_input_path(kind: type[Settings], key: str) -> bool:
-    """Return whether a key is the path of an input file or folder."""
+    """Return whether the value of a key is the path of an input file or folder."""
     field = kind.model_fields[key]
     return InputPath in (field.annotation, *typing.get_args(field.annotation)) or any(
         isinstance(item, AfterValidator) and item.func is _check_path for item in field.metadata

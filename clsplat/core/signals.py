@@ -107,7 +107,7 @@ def stop_at_once() -> None:
 
 
 def stop_if_signaled() -> None:
-    """Raise KeyboardInterrupt if the outermost block received a signal: a library may have caught the first one."""
+    """Raise KeyboardInterrupt if the outermost block received a signal; a library may have suppressed its exception."""
     if _received.number and threading.current_thread() is threading.main_thread():
         raise KeyboardInterrupt
 

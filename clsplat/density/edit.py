@@ -3,7 +3,7 @@
 A rule sets the outcome of Gaussians: the number of rows that each becomes.  Most rules match a range of a statistic,
 size, and opacity, and one kernel applies them; others select Gaussians on the host.  A size is the largest standard
 deviation relative to the scene's extent.  The first growing rule that matches a Gaussian sets its outcome.  Pruning
-rules override growth, and compare the size of the children after a split.
+rules override growth, and apply to the size of the children after a split.
 """
 
 import math
@@ -40,7 +40,7 @@ def encode_outcomes(
 ) -> NDArray[np.uint32]:
     """Return copies + 1 for the Gaussians in the mask, and 0 for the others, [N].
 
-    count: the number of Gaussians, N.  Raises ValueError like `Edit.choose`.
+    count: the number of Gaussians, N.  Raises ValueError as `Edit.choose` does.
     """
     copies = np.asarray(copies)
     if mask.dtype != np.bool_ or mask.shape != (count,):
@@ -145,7 +145,7 @@ class Edit:
         )
 
     def matching_threshold(self, statistic: str, other: str, gradient_above: float) -> float:
-        """Return the threshold of `statistic` that as many Gaussians reach as reach `gradient_above` in `other`."""
+        """Return the threshold on `statistic` that selects as many Gaussians as `gradient_above` selects by `other`."""
         if self.gaussians.count == 0:
             return MIN_BOUND
         fraction = float(np.mean(self.stats.mean(other) >= np.float32(gradient_above)))
@@ -188,7 +188,8 @@ class Edit:
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
         """Set the values of a table, [n, copies, components], for the new rows of distinct Gaussians, [n].
 
-        copies: number of rows that replace each Gaussian.  If its growth is undone later, its values do not change.
+        copies: number of rows that replace each Gaussian.  If the growth of a Gaussian is undone later, its values do
+        not change.
         Raises ValueError for invalid rows (see `check_rows`) and for values of a wrong shape.
         """
         components = self.gaussians.tables[name].components
@@ -220,7 +221,7 @@ class Edit:
     def limit(self, limit: int) -> None:
         """Undo growth until at most `limit` rows remain.
 
-        Gaussians with the smallest means of the first scalar statistic are undone first.
+        The growth of Gaussians with the smallest means of the first scalar statistic is undone first.
         """
         rows = self.row_counts().astype(np.int64)
         growing_rows = np.flatnonzero(rows > 1)

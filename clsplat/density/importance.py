@@ -29,10 +29,10 @@ class Weights:
 def weights(
     views: Iterable[RenderedView], count: int, weight_per_view: float | None = None, dtype: DTypeLike = np.float64
 ) -> Weights:
-    """Return the weights of N = `count` Gaussians, added in the order of the views.
+    """Return the weights of N = `count` Gaussians, summed over views in their order.
 
-    weight_per_view: the Gaussians with the largest weights that make up this fraction of a view's weight are useful in
-    the view; None: do not count views.  dtype: type of the total.
+    weight_per_view: the Gaussians with the largest weights in a view, which together have this fraction of its total
+    weight, are useful in the view; None: do not count views.  dtype: data type of `total`.
     """
     total, useful_views = np.zeros(count, dtype), np.zeros(count, np.int64)
     for view in views:
@@ -44,7 +44,7 @@ def weights(
 
 
 def select_by_weight(weight: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
-    """Return the mask, [N], of the smallest set of Gaussians with `fraction` of the total weight, all above 0."""
+    """Return the mask, [N], of the smallest set of Gaussians of nonzero weight with `fraction` of the total weight."""
     order = np.argsort(-weight, kind="stable")
     preceding_sum = np.cumsum(weight[order]) - weight[order]  # of all larger weights
     mask = np.zeros(len(weight), bool)

@@ -30,7 +30,7 @@ def surface(log_scales: Floats) -> Floats:
 
 
 def masses(tables: dict[str, Floats], size_of: Size = volume) -> Floats:
-    """Return the mass of each Gaussian, its opacity times its size, [N]."""
+    """Return the mass of each Gaussian, its opacity times its size (`volume` or `surface`), [N]."""
     mass: Floats = size_of(tables["log_scales"]) / inverse_opacities(tables["logit_opacity"][:, 0])
     return mass
 

@@ -200,7 +200,7 @@ class Gltf:
         return np.maximum(rows / np.float32(np.iinfo(dtype).max), -1).astype(np.float32)
 
     def _buffer_view(self, index: Any, stride: int = 0) -> tuple[bytes, int, int, int]:
-        """Return the buffer of a view, and the view's offset, length, and stride in bytes.  stride: its default."""
+        """Return the buffer of a view, and the view's offset, length, and stride (by default `stride`), in bytes."""
         view = self.tree["bufferViews"][_index(index)]
         if compressions := [name for name in view.get("extensions", {}) if "compression" in name]:
             raise DataError(f"{self.path}: is compressed with {quote(compressions[0])}; export it without compression")
@@ -297,7 +297,7 @@ def _has_gaussians(extensions: dict[str, Any]) -> bool:
 
 
 def _spz_view(extensions: dict[str, Any]) -> Any:
-    """Return the buffer view that contains an SPZ file, under any of its draft names, or None."""
+    """Return the buffer view that contains an SPZ file, under any draft name of the extension, or None."""
     return next((extension["bufferView"] for name, extension in extensions.items() if "spz" in name), None)
 
 
@@ -344,7 +344,7 @@ def gltf_files(path: Path) -> list[Path]:
 
 
 def read_gltf(path: Path) -> SplatFile:
-    """Read the Gaussians of a .glb or .gltf file.  Raises DataError if it is missing, damaged, or has none."""
+    """Read the Gaussians of a .glb or .gltf file.  Raises DataError if it is missing, damaged, or without Gaussians."""
     data = read_file(path, "a .glb or .gltf file", limit=MAX_FILE)
     is_text = not data.startswith(MAGIC) and (path.suffix.lower() == ".gltf" or data.lstrip()[:1] == b"{")
     text, binary = (data, None) if is_text else _read_chunks(path, data)
@@ -391,7 +391,8 @@ def write_primitive(
     """Write a .glb file with one primitive; return its SHA-256.  Raises OutputError.
 
     attributes: tables [N, components] in the axes of glTF; integers are normalized.  primitive, tree: other entries of
-    the primitive and of the file.  origin: world coordinates of zero, [3], in the axes of a PLY.  indices: of triangles
+    the primitive and of the file.  origin: world coordinates of the model's origin, [3], in the axes of a PLY.
+    indices: the vertices of triangles, [triangles, 3].
     """
     tables = attributes if indices is None else {**attributes, INDICES: indices.reshape(-1, 1)}
     views: list[Any] = []

@@ -1,4 +1,4 @@
-"""Time training steps of several scenes in alternation, so that a slow machine affects all scenes; report medians."""
+"""Time training steps of scenes in alternation, so that a temporary slowdown affects all scenes; report medians."""
 
 import statistics
 import time
@@ -305,6 +305,6 @@ def load_case(device: Device, model: Path, scene: Path, settings: PipelineFile) 
 
 
 def with_near(settings: PipelineFile, near: float) -> PipelineFile:
-    """Return the settings, with `near`, in scene units, as the near plane if it is `auto`."""
+    """Return settings in which a near plane of `auto` is replaced with `near`, in scene units."""
     model = settings.model.model_copy(update={"near": near})
     return settings.model_copy(update={"model": model}) if settings.model.near == "auto" else settings

@@ -60,7 +60,7 @@ def image_for(rng: np.random.Generator, grid: NDArray[Any], width: int, height: 
 def check_grid(
     device: Device, rng: np.random.Generator, width: int, height: int, nodes: tuple[int, ...], channels: int = 3
 ) -> Results:
-    """Compare the image after a grid, and the gradients of the image and the grid."""
+    """Compare an image transformed by a grid, and the gradients of the image and the grid."""
     label = f"{width} x {height} px, {' x '.join(map(str, nodes))} matrices"
     grids = random_grids(device, rng, nodes)
     grid = photograph_grid(grids, grids.tables()["values"][1])
@@ -137,7 +137,7 @@ def color_grid_tables(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_color(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
-    """Compare the image after a color matrix, with a third of its pixels above 1, and both gradients."""
+    """Compare an image with values above 1, transformed by a color matrix, and the gradients of both."""
     label = f"{width} x {height} px"
     matrix = (IDENTITY + rng.normal(0, 0.2, (3, 4))).astype(np.float32).astype(np.float64)
     image = rng.uniform(-0.2, 1.6, (channels, height, width)).astype(np.float32)
@@ -176,7 +176,7 @@ def colors(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_response(device: Device, rng: np.random.Generator, width: int, height: int, channels: int = 3) -> Results:
-    """Compare the image after a camera response, with values below 0 and above 1, and both gradients."""
+    """Compare an image with values outside [0, 1], transformed by a camera response, and the gradients of both."""
     label, kernel = f"{width} x {height} px", "camera_response"
     row = np.concatenate([rng.normal(0, 0.1, 5), rng.normal(0, 0.4, 12)])
     image = rng.uniform(-0.3, 1.5, (channels, height, width)).astype(np.float32)

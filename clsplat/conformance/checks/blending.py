@@ -99,7 +99,7 @@ def _make_opaque(parameters: dict[str, NDArray[Any]]) -> None:
 
 
 def make_dim(parameters: dict[str, NDArray[Any]]) -> None:
-    """Make splats so faint that transmittance falls below 0.01 within a batch of 256, and 40 more contribute."""
+    """Make splats so faint that the transmittance is below 0.01 after 256 splats, but 40 more still contribute."""
     parameters["log_scales"] += 4
     parameters["logit_opacity"][:] = -3.7
 
@@ -158,7 +158,7 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("blend_backward")
 def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
-    """Compare a loss of the transmittance with one of an image of black splats in front of a white channel."""
+    """Compare a loss on the transmittance with the same loss on an image of black splats on a white background."""
     for count, width, height in ((1, 16, 16), (17, 33, 15), (65, 24, 24)):
         case, label = safe_case(rng, count, width, height, MARGIN), f"with the transmittance, {count} Gaussians"
         rasterizer, model, camera = Rasterizer(device, "radix"), case.model(device), case.device_camera(device)

@@ -38,7 +38,7 @@ def to_planes(device: Device, camera: DeviceCamera, image: NDArray[Any]) -> Arra
 
 
 def blank_image(camera: DeviceCamera, planes: NDArray[Any]) -> NDArray[Any]:
-    """Return a copy of the planes in which the image is zero, and the padding unchanged."""
+    """Return a copy of the planes in which the image is zero and the padding is unchanged."""
     padding = planes.copy()
     padding[..., : camera.height, : camera.width] = 0
     return padding
@@ -154,7 +154,7 @@ def blur(device: Device, rng: np.random.Generator) -> Results:
 def check_haar(
     device: Device, rng: np.random.Generator, width: int, height: int, fraction: float | None, taps: NDArray[Any]
 ) -> Results:
-    """Compare the image after a Haar filter and the gradient of its taps.  A `fraction` of pixels is unmasked."""
+    """Compare a Haar-filtered image and the gradient of the taps.  A `fraction` of the pixels is unmasked."""
     image, gradient = rng.uniform(0, 1, (3, height, width)).astype(np.float32), rng.normal(size=(3, height, width))
     mask = None if fraction is None else rng.random((height, width)) < fraction
     camera, workspace = make_camera(device, width, height), Workspace(device)
@@ -213,7 +213,7 @@ SCALES = (1.0, 1e-2, 8.0)  # factors on differences; some put residuals outside 
 def check_transient(
     device: Device, rng: np.random.Generator, width: int, height: int, scale: float, fraction: float | None
 ) -> Results:
-    """Compare residuals, their histogram, and masks.  A `fraction` of pixels is unmasked; None: all pixels."""
+    """Compare residuals, their histogram, and masks.  A `fraction` of the pixels is unmasked; None: all."""
     x, y = image_pair(rng, width, height)
     x = (y + np.float32(scale) * (x - y)).astype(np.float32)
     unmasked = np.ones((height, width), bool) if fraction is None else rng.random((height, width)) < fraction
@@ -253,7 +253,7 @@ FUSION_MARGIN = 1e-3  # to a decision, px or truncations
 
 
 def depth_image(rng: np.random.Generator, width: int, height: int) -> DepthImage:
-    """Return a view of two surfaces, with pixels of unknown depth."""
+    """Return a depth image of two surfaces, in which the depth of some pixels is unknown."""
     depth = np.where(rng.random((height, width)) < 0.3, 2.5, 4) + np.linspace(0, 1, width) ** 2
     depth += 0.3 * (rng.random((height, width)) < 0.1) + np.linspace(0, 0.5, height)[:, None]
     depth = ndimage.median_filter(depth, 3) * (rng.random((height, width)) < 0.95)

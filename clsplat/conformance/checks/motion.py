@@ -86,7 +86,7 @@ def check_zero_motion(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_step(device: Device, rng: np.random.Generator, count: int, width: int, every: int = 0xFFFFFFFF) -> Results:
-    """Compare two updates in which durations reach their bound.  every: 0 to update only visible rows."""
+    """Compare two updates in which durations reach their bound.  every: as for `update_motion`."""
     case = moving_case(rng, count, width)
     model, rates = case.model(device), MotionRates(log_duration=0.5, min_duration=0.3).at(3, EXTENT)
     gaussians, min_duration = model.gaussians, float(np.log(0.3))

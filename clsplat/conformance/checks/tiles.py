@@ -31,7 +31,7 @@ def check_scan(device: Device, values: NDArray[Any]) -> Deviation:
 
 
 def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
-    """Compare a stable sort of keys below 2^bits, of all keys and of those that a number on the device counts."""
+    """Compare stable sorts of keys below 2^bits: of all keys, and of the first keys, up to a count in device memory."""
     for count, label in ((len(keys), ""), (len(keys) * 3 // 4, f" of {len(keys)}")):
         key_count = device.upload(np.array([count], np.uint32)) if label else None
         sorted_keys, order = make_tiler(device).sort_pairs(device.upload(keys), bits, len(keys), "test", key_count)
@@ -128,10 +128,10 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
 
 
 def _max_alpha(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the largest alpha of each record in each tile, and whether it decides if the pair is allowed, [T, N].
+    """Return the largest alpha of each record in each tile, and a mask of the pairs that must reach a pixel, [T, N].
 
-    The alpha does not decide this for tiles at the edge of the image and for splats thinner than a few pixels, whose
-    pairs may be listed although they reach no pixel.
+    Other pairs may be listed with any alpha, because the tile extends beyond the image, or the splat is thinner than a
+    few pixels.
     """
     records, camera = frame.splats.get().astype(np.float64), frame.camera
     (width, height), tile = case.size, camera.tile
@@ -160,7 +160,7 @@ UNTOUCHED = 0xDEADBEEF
 
 
 def large_case(device: Device, rng: np.random.Generator, columns: int, rows: int, count: int = 6) -> Case:
-    """Return a case of Gaussians half as large as the image's longer side, of which every third is ten times smaller.
+    """Return a case of Gaussians half as large as the image's longer side; every third is ten times smaller.
 
     columns, rows: size of the image, in tiles.
     """
@@ -178,7 +178,7 @@ def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_large(device: Device, rng: np.random.Generator) -> Results:
-    """Check the lists of images with many rows of tiles, of splats that reach about 32 tiles, and of wrong counts."""
+    """Check tile lists for many rows of tiles, for splats that reach about 32 tiles, and for wrong counts."""
     for columns, rows in (TALL, *MASK_SIZED):
         case, label = large_case(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
         yield from check_list(device, case, "radix", label)
@@ -186,7 +186,7 @@ def check_large(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_wrong_counts(device: Device, case: Case) -> Results:
-    """Check that each splat lists `count` distinct tiles, even if its count is wrong."""
+    """Check that each large splat is listed in as many distinct tiles as its `tile_count`, even if that is wrong."""
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(case.model(device), case.device_camera(device), device.zeros(3))
     gaussian_count, camera = len(case.parameters["means"]), frame.camera

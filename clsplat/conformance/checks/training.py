@@ -95,7 +95,7 @@ def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str
 
 
 def check_rows(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare the fifth update, limited to visible rows, by each kernel, given the same gradients and moments."""
+    """Compare the fifth update by each kernel, of visible rows only, from the same gradients and moments."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
         name: (rng.normal(size=values.shape), rng.uniform(0.5, 2, values.shape))
@@ -281,7 +281,7 @@ def train(
 
 
 def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Results:
-    """Compare deferred updates with the reference, and with the bits of immediate updates."""
+    """Compare deferred updates with the reference; check that they are bit-identical to immediate updates."""
     case = random_case(rng, count)
     initial = case.parameters["sh_rest"]
     masks = [random_visible_rows(rng, count) for _ in range(STEPS)]

@@ -94,8 +94,8 @@ def training(device: Device, rng: np.random.Generator) -> Results:
 def memory(device: Device, rng: np.random.Generator) -> Results:
     """Allocate buffers of growing size, up to the largest that the device allows; write each and read samples.
 
-    A failed allocation is not a failure of the check, since other programs may use memory, which OpenCL does not
-    report.
+    A failed allocation is not a failure of the check: other programs may use the memory, and OpenCL does not report
+    how much of it is free.
     """
     max_allocation, free_memory = device.info.allocation, available_memory()
     budget = int(MEMORY_FRACTION * min(device.info.memory, device.info.memory if free_memory is None else free_memory))

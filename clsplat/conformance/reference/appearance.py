@@ -14,7 +14,7 @@ WEIGHTS = np.array([0.299, 0.587, 0.114])  # of the luminance, BT.601
 
 
 def apply_color_grid(image: NDArray[Any], grid: NDArray[Any]) -> NDArray[Any]:
-    """Return min(1, c + A [c; 1]) for every pixel.  A is the grid, interpolated at its position and luminance."""
+    """Return min(1, c + A [c; 1]) for every pixel c.  A is the grid, interpolated at c's position and luminance."""
     return np.minimum(unclamped_grid_colors(image, grid), 1)
 
 
@@ -146,7 +146,7 @@ def _falloff(
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return the vignetting v, [H, W], the squared radius q, [H, W], and the offset from the center, [2, H, W].
 
-    Lengths are in half diagonals of the image.
+    The unit of length is half the diagonal of the image.
     """
     _, height, width = image.shape
     half = np.hypot(width, height) / 2
@@ -170,7 +170,7 @@ def _locate_quarter(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _curve(x: NDArray[Any], slopes: NDArray[Any]) -> NDArray[Any]:
-    """Integrate slopes from 0 to x.  They are linear between multiples of 1/4, and constant below 0 and above 1."""
+    """Integrate slopes from 0 to x.  Slopes are linear between multiples of 1/4, and constant below 0 and above 1."""
     quarter, d = _locate_quarter(x)
     start_value = np.concatenate([[0], np.cumsum(slopes[1:] + slopes[:-1]) / 8])[quarter]
     value = start_value + slopes[quarter] * d + 2 * (slopes[quarter + 1] - slopes[quarter]) * d**2

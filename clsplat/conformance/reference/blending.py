@@ -37,7 +37,7 @@ def density(x: Floats) -> Floats:
 
 
 def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
-    """Return the mass of a normal distribution within ½ of `dy`, and its mean and variance there.
+    """Return the mass, mean, and variance of the part of a centered normal distribution within ½ px of `dy`.
 
     dy: at least 0, in px; s: standard deviation, in px.
     """
@@ -240,7 +240,7 @@ def falloff_squares(
 
 
 class Margin(NamedTuple):
-    """The smallest relative distances to thresholds that rounding may cross; infinity without comparisons."""
+    """The smallest relative distances of values to thresholds that rounding may cross; infinity without values."""
 
     alpha: float  # |α / alpha_min - 1| over pixels that have not stopped
     transmittance: float  # |T' / transmittance_min - 1| over splats that are not too faint
@@ -308,7 +308,10 @@ def inverse_depth(splats: Splats, width: int, height: int, thresholds: Threshold
 
 
 def median_depth(splats: Splats, width: int, height: int) -> tuple[Floats, Floats]:
-    """Return the depth of the splat that takes the transmittance T below ½, or 0, and the least |T - ½|, both [H,W]."""
+    """Return the depth of the splat that takes the transmittance T below ½, and the least |T - ½|, both [H, W].
+
+    The depth is 0 where T stays at or above ½.
+    """
     depth, gap = np.zeros((height, width)), np.full((height, width), 0.5)
     for step in blend_steps(splats, width, height, Thresholds()):
         after = step.transmittance * np.where(step.is_blended, 1 - step.alpha, 1)
@@ -320,7 +323,7 @@ def median_depth(splats: Splats, width: int, height: int) -> tuple[Floats, Float
 def inverse_depth_backward(
     splats: Splats, width: int, height: int, grad: Floats, thresholds: Thresholds = Thresholds()
 ) -> tuple[SplatGradients, Floats]:
-    """Return the gradients of the splats, zero for colors, and dL/dz, [N].  grad: dL/dD, [H, W]."""
+    """Return the gradients of the splats, which are zero for colors, and dL/dz, [N].  grad: dL/dD, [H, W]."""
     planes = np.stack([grad, *np.zeros((2, *grad.shape))])
     grads = blend_backward(_color_by_inverse_depth(splats), width, height, BLACK, planes, thresholds)
     grad_depth = -grads.color[:, 0] * _color_by_inverse_depth(splats).color[:, 0] ** 2
@@ -344,7 +347,7 @@ def inverse_depth_loss(
 
 
 def overlay(layer: NDArray[Any], transmittance: NDArray[Any], image: NDArray[Any]) -> NDArray[Any]:
-    """Return the composite of a layer on black, [3, H, W], and an image behind it.  Other planes are unchanged."""
+    """Composite a layer, rendered on black, over the first 3 planes of an image, [C, H, W]; keep the other planes."""
     return np.concatenate([layer + transmittance * image[:3], image[3:]])
 
 

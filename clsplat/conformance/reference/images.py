@@ -23,7 +23,7 @@ def l1(x: NDArray[Any], y: NDArray[Any]) -> tuple[float, NDArray[Any]]:
 
 
 def view_error(gradient: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> float:
-    """Return the sum of |gradient * (x - y)|.  gradient: of the losses with respect to x."""
+    """Return the sum of |gradient * (x - y)|.  gradient: the gradient of the losses with respect to x."""
     return float(np.abs(gradient * (x - y)).sum())
 
 
@@ -155,8 +155,8 @@ def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
 def haar_filter(image: NDArray[Any], taps: NDArray[Any], mask: NDArray[Any] | None = None) -> NDArray[Any]:
     """Analyze and synthesize an image along both axes.
 
-    Images of odd size are padded with their last row or column.  Masked pixels are replaced with the mean of their
-    2 x 2 block.  image: [3, H, W]; taps: [2]; mask: [H, W] bool.
+    Images of odd size are padded with their last row or column.  Masked pixels are replaced with the mean of the
+    unmasked pixels in their 2 x 2 block, if there are any.  image: [3, H, W]; taps: [2]; mask: [H, W] bool.
     """
     _, height, width = image.shape
     odd = ((0, height % 2), (0, width % 2))
@@ -207,7 +207,7 @@ def mask_transients(
 ) -> NDArray[np.bool_]:
     """Return a mask, [H, W], of the pixels that are not transient.
 
-    Their residuals, or at least half of the residuals in the box around them, are below the threshold.
+    A pixel is transient if its residual, and more than half of the residuals in the box around it, reach the threshold.
     """
     mask = unmasked & (values < threshold)
     is_below = mask.copy()
@@ -231,9 +231,11 @@ def project_points(points: NDArray[Any], camera: PinholeCamera) -> tuple[NDArray
 def integrate_view(
     points: NDArray[Any], pixels: NDArray[Any], camera: PinholeCamera, truncation: float
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return what a view adds to each point, [6, P], and the smallest margin to a decision in px or truncations, [P].
+    """Return what a view adds to the sums at each point, [6, P], and the point's margin, [P].
 
-    pixels: [H, W, 4] colors and depth.  The rows: distance, 1; near the surface also red, green, blue, 1.
+    A view that sees the point adds the point's signed distance to the surface, as a fraction of `truncation`, and 1;
+    near the surface, it also adds red, green, blue, and 1.  The margin is the smallest distance of a value to a
+    threshold, in px or as a fraction of `truncation`.  pixels: [H, W, 4], colors and depth.
     """
     position, z, is_shown = project_points(points, camera)
     sums, margin = np.zeros((6, len(points))), np.abs(2 * position - np.rint(2 * position)).min(axis=1) / 2

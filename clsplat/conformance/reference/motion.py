@@ -1,8 +1,8 @@
 """Compute moving Gaussians at a timestamp and the gradient of their motion, one Gaussian after another.
 
 A row of motion contains the velocity [3], time center, and log of the duration; the acceleration [3] and jerk [3] for
-degree 2 or 3; and the time derivative of the quaternion [4] if Gaussians rotate.  FreeTimeGS (Wang et al. 2025),
-Spacetime Gaussians (Li et al. 2024).
+degree 2 or 3; and the time derivative of the quaternion [4] if Gaussians rotate.  See FreeTimeGS (Wang et al.
+2025) and Spacetime Gaussians (Li et al. 2024).
 """
 
 from typing import Any

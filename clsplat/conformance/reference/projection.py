@@ -144,7 +144,7 @@ def view_direction(camera: PinholeCamera, mean: NDArray[Any]) -> tuple[NDArray[A
 
 
 def unclamped_color(gaussians: RawGaussians, n: int, camera: PinholeCamera, degree: int) -> NDArray[Any]:
-    """Return the color of Gaussian `n` before it is clamped to 0, Σ Y_k(d) c_k + 0.5, [3]."""
+    """Return the color of Gaussian `n` before negative values are clamped, Σ Y_k(d) c_k + 0.5, [3]."""
     basis = sh_basis(view_direction(camera, gaussians.means[n])[0], degree)
     return basis @ gaussians.sh[n, : len(basis)] + 0.5
 
@@ -173,8 +173,9 @@ def project(
 ) -> Splats:
     """Project Gaussians to splats.
 
-    degree: active degree of the harmonics; variance (px²), compensate (0 or 1): screen filter; pixel_box: 1 to
-    integrate splats over the box of each pixel, with variance and compensate 0.
+    degree: active degree of the harmonics.  variance: of the screen filter, px².  compensate: 1 if the screen filter
+    scales opacities by κ, else 0.  pixel_box: 1 to integrate splats over the box of each pixel; this requires
+    `variance` and `compensate` to be 0.
     """
     count = len(gaussians.means)
     splats = Splats(
@@ -288,7 +289,7 @@ def project_backward(
     grad_opacity: NDArray[Any],
     grad_color: NDArray[Any],
 ) -> dict[str, NDArray[Any]]:
-    """Return the gradients of `PARAMETERS` by name, zero for culled Gaussians; `filter_variance` is a constant."""
+    """Return the gradients of `PARAMETERS` by name, zero for culled Gaussians; `filter_variance` is held constant."""
     grad = {name: np.zeros_like(getattr(gaussians, name)) for name in PARAMETERS}
     for n in np.flatnonzero(splats.visible).tolist():
         footprint = project_covariance(gaussians, n, camera, variance)

@@ -1,4 +1,4 @@
-"""Compute random numbers by Philox 4x32-10 (Salmon et al. 2011), also normally distributed (Box and Muller 1958)."""
+"""Generate random words (Philox 4x32-10, Salmon et al. 2011) and normal random numbers (Box and Muller 1958)."""
 
 import math
 

@@ -1,6 +1,6 @@
 """Compute images and gradients of the sky, an octahedral environment map, and the loss of Gaussians that cover it.
 
-A map is [side, side, C]: row j, column i.  Directions are [H, W, 3] in the scene.
+A map is [side, side, C]: row j, column i.  Directions are [H, W, 3], in scene axes.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ Entry = tuple[int, int, float]  # row and column of a texel, weight
 
 
 def rays(camera: PinholeCamera, width: int, height: int) -> NDArray[Any]:
-    """Return the directions through the centers of pixels, [H, W, 3], in the scene."""
+    """Return the directions through the centers of pixels, [H, W, 3], in scene axes."""
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(height) + 0.5 - camera.cy) / camera.fy
     camera_rays = np.stack([*np.meshgrid(x, y), np.ones((height, width))], axis=-1)
@@ -64,7 +64,8 @@ def sky_gradient(side: int, directions: NDArray[Any], transmittance: NDArray[Any
 def sky_mask(sky: NDArray[Any], photograph: NDArray[Any], difference: float) -> NDArray[Any]:
     """Return a mask, [H, W], of pixels with at least 6 sky pixels in their 3 x 3 neighborhood.
 
-    sky, photograph: [3, H, W]; difference: the largest mean absolute difference, over channels, of a sky pixel.
+    sky, photograph: [3, H, W].  difference: the largest absolute difference of a sky pixel from `sky`, averaged over
+    channels.
     """
     matches = np.pad(np.abs(sky - photograph).mean(axis=0) <= difference, 1)
     height, width = photograph.shape[1:]

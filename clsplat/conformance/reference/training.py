@@ -137,7 +137,7 @@ def adc_actions(
     """Return KEEP, CLONE, SPLIT or PRUNE for each Gaussian, [N].
 
     Pruning is last, and applies to the new rows: copies and children have their parent's opacity, and children its
-    scale / 1.6.  split_gradient: the statistic for splits, if it is another, such as the absolute gradient.
+    scale divided by 1.6.  split_gradient: the statistic for splits, such as the absolute gradient; None: `gradient`.
     """
     split_gradient = gradient if split_gradient is None else split_gradient
     actions = []
@@ -180,7 +180,7 @@ def screen_splitting(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> NDArray[Any]:
-    """Return the sums over pixels of dL/dalpha times the Hessian of alpha in the splat's mean, [N, 2, 2] px⁻²."""
+    """Return dL/dalpha times the Hessian of alpha with respect to the mean, summed over pixels, [N, 2, 2] px⁻²."""
     matrices = np.zeros((len(splats.opacity), 2, 2))
     for step, grad_alpha in alpha_gradients(splats, width, height, background, grad_image, thresholds):
         a, b, c = splats.conic[step.splat]
