@@ -82,7 +82,7 @@ def _prefix_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _first_cuts(sorted_values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return cuts whose density is the cube root of the density of the values (Panter and Dite 1951)."""
+    """Return cuts with a density proportional to the cube root of that of the values (Panter and Dite 1951)."""
     edges = np.linspace(sorted_values[0], sorted_values[-1], 4 * ENTRIES + 1)
     positions = np.searchsorted(sorted_values, edges)
     weight = np.concatenate([[0.0], np.cumsum(np.cbrt(np.diff(positions)))])

@@ -234,7 +234,7 @@ def _split_clusters(points: NDArray[np.float32], weights: NDArray[np.float64], m
 def _bisect(
     points: NDArray[np.float32], weights: NDArray[np.float64], cluster: Labels, is_second: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Split each cluster into two by Lloyd's iteration; return which points are in the second half, [N]."""
+    """Split each cluster into two by Lloyd's iteration; return a mask of the points in second halves, [N]."""
     cluster_count = int(cluster.max()) + 1
     for _ in range(LLOYD_STEPS):
         half = 2 * cluster + is_second

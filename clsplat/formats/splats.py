@@ -214,7 +214,7 @@ def flip_axes_in_place(parameters: Parameters, axes: Sequence[float] = FLIP) -> 
 
 
 def _signs(parameters: Parameters, axes: Sequence[float]) -> Parameters:
-    """Return the factors, 1 or -1, of the columns of each table that changes when axes flip."""
+    """Return the factor, 1 or -1, of each column, for each table that changes when axes are flipped."""
     by_axis = dict(zip("xyz", axes, strict=True))
     (x, y, z), parities = axes, [math.prod(by_axis[axis] for axis in names) for names in PARITY]
     sh_signs = np.repeat(parities, 3)[: parameters["sh_rest"].shape[1]]

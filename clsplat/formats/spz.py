@@ -297,7 +297,7 @@ class ZstdFrame:
 
 
 def _open_zstd(data: bytes) -> tuple[Any, type[Exception]]:
-    """Return a stream that decompresses a frame, and the error that it raises for a damaged frame."""
+    """Return a stream that decompresses a frame, and the type of the error that it raises if the frame is damaged."""
     with suppress(ImportError):
         from compression import zstd
 

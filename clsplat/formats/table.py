@@ -265,7 +265,7 @@ def write(path: Path, splats: SplatFile, options: WriteOptions | None = None) ->
 
 
 def warn_about_losses(path: Path, splats: SplatFile) -> None:
-    """Warn if the format of a file name cannot store the mip mark, the rendering settings, or the origin."""
+    """Warn if the format of a file name cannot store the mark of a mip model, the rendering settings, or the origin."""
     codec = writing_format(path)
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning(

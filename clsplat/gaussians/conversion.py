@@ -86,7 +86,7 @@ QUALITIES = get_args(Quality)
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes to a model, applied in this order."""
+    """Changes to a model, applied in the order of these fields."""
 
     drop_below: float = 0.0  # opacity below which Gaussians are dropped
     filter_floaters: bool = False
@@ -507,7 +507,7 @@ def fibonacci_sphere(count: int) -> NDArray[np.float64]:
 
 
 def _rotations_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return quaternions, [N, 4], that rotate the z axis to unit vectors."""
+    """Return quaternions, [N, 4], that rotate the z axis onto unit vectors."""
     x, y, z = directions.T
     return np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)
 

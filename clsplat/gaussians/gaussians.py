@@ -62,7 +62,7 @@ class DropoutMask:
 
     @property
     def opacity_factor(self) -> float:
-        """The factor on remaining opacities that conserves their mean over steps (DropGaussian, Park et al. 2025)."""
+        """The factor on the remaining opacities that preserves their mean (DropGaussian, Park et al. 2025)."""
         return 1 / (1 - self.probability)
 
 
@@ -120,7 +120,7 @@ class Gaussians:
 
     @property
     def key(self) -> tuple[int, ...]:
-        """Numbers that identify the memory and the sizes of all tables, as a part of the keys of plans."""
+        """Numbers that identify the memory and the sizes of all tables; the keys of plans contain them."""
         slots = (self.on_host.slot.buffer.serial, self.on_host.block_size) if self.on_host else ()
         return (self.count, self.capacity, *slots, *map(_serial, self.tables.values()))
 
@@ -282,7 +282,7 @@ class DeviceModel:
 
     @property
     def key(self) -> tuple[float, ...]:
-        """Numbers that identify the model, except for its dropout and its sky, as a part of the keys of plans."""
+        """Numbers that identify the model, except for its dropout and its sky; the keys of plans contain them."""
         screen_filter = self.screen_variance, self.compensate, self.pixel_box
         return (self.degree, self.near, *screen_filter, *self.gaussians.key)
 

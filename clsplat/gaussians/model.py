@@ -131,7 +131,7 @@ MIN_LOGIT = -80.0  # of an opacity that the filter reduces to nothing; smallest 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """N Gaussians before activation, float32, with the same names as in pipelines, kernels, and checkpoints.
+    """N Gaussians before activation, as float32 arrays with the names used in pipelines, kernels, and checkpoints.
 
     The arrays are copied.  Raises ValueError, with the name of the table, if shapes do not match.
     """
@@ -368,7 +368,7 @@ MAX_SPACING = 0.05  # of positions, relative to the median scale; a larger spaci
 
 
 def is_float32_precise(means: NDArray[np.floating], log_scales: Floats) -> bool:
-    """Return whether float32 is precise enough for the means, [N, 3], of Gaussians with these scales, [N, 3].
+    """Return whether float32 is precise enough for the means, [N, 3], of Gaussians with these log scales.
 
     Also returns True for means beyond MAX_NUMBER, which are not valid coordinates.
     """

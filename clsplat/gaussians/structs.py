@@ -1,4 +1,4 @@
-"""Define protocols and helpers for modules that `gaussians.py` imports, so that they need not import its classes."""
+"""Define protocols and helpers for modules that `gaussians.py` imports and that cannot import its classes."""
 
 import copy
 from typing import Any, ClassVar, Protocol

@@ -114,7 +114,7 @@ def verdict(report: dict[str, Any]) -> str:
 
 
 def _find_activated(model: Model) -> list[str]:
-    """Return findings about values to which the activation function seems to be applied already."""
+    """Return findings about values to which the activation function seems to have been applied already."""
     if len(model) < MIN_COUNT:
         return []
     findings = []

@@ -17,7 +17,7 @@ class Momentum(Budget):
     al. 2025).
 
     The final number is the initial number plus a momentum, which starts at `initial_momentum` times the initial number.
-    Each edit sets the momentum to `keep` times itself plus the number of Gaussians that could grow, if that is larger.
+    Each edit raises the momentum to `keep` times itself plus the number of Gaussians that could grow, if that is more.
     During training, the increase is divided by d^(2 - t), with d the divisor of the image size and t the fraction of
     the steps that are done.  Edits at their limit still replace pruned Gaussians.
     """

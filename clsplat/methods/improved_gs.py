@@ -52,7 +52,7 @@ class SplitLongAxis(Rule):
     gradient_above: Positive = 3.0e-4
     """Smallest mean of `screen_grad_abs` of a Gaussian that is split."""
     views: Annotated[int, Field(ge=1)] = 10
-    """Number of training views of the score, sampled by seed and step; all if there are fewer."""
+    """Number of training views for the score, sampled by seed and step; all if there are fewer."""
     distance: Positive = 1.35
     """Offset of each child, in standard deviations of the parent along its longest axis (published: 0.45 · 3)."""
     opacity: Annotated[float, Field(gt=0, le=1)] = 0.6

@@ -99,7 +99,7 @@ class AddNoise(Scheduled):
     rate: NonNegative = 80.0
     """Scale of the noise.  Published: 5e5 times the learning rate of the means, times the squared extent."""
     opacity_below: Positive = 0.005
-    """Opacity at which the noise is half as strong."""
+    """Opacity at which the sigmoid factor of the noise is 1/2."""
 
     def run(self, run: Run) -> None:
         rate, max_opacity = at_step(self.rate, run.step) / run.scene.extent, at_step(self.opacity_below, run.step)

@@ -34,7 +34,7 @@ def sampled_weights(survey: Survey, weight_per_view: float | None = None, number
 def find_useless(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
     """Return a mask, [V, N], of the Gaussians that are visible but not useful in each view.
 
-    The Gaussians with the largest weights that make up `weight_per_view` of a view's weight are useful in the view.
+    A view's useful Gaussians are those with the largest weights, up to `weight_per_view` of the view's total weight.
     """
     is_useless = np.zeros((len(survey.views), survey.count), bool)
     for row, render in zip(is_useless, survey.render(survey.views), strict=True):
@@ -45,8 +45,8 @@ def find_useless(survey: Survey, weight_per_view: float) -> NDArray[np.bool_]:
 class PruneUseless(Rule):
     """Remove Gaussians that are useful in few training views, and the Gaussians with the smallest weights.
 
-    The weight of a Gaussian in a view is the sum of alpha T over its pixels.  The Gaussians with the largest weights
-    that make up `weight_per_view` of the view's weight are useful in the view.
+    The weight of a Gaussian in a view is the sum of alpha T over its pixels.  A view's useful Gaussians are those
+    with the largest weights, up to `weight_per_view` of the view's total weight.
     """
 
     type: Literal["prune_useless"] = "prune_useless"
@@ -72,9 +72,9 @@ class HideUseless(Scheduled):
     """Save time in a training step by skipping the Gaussians that contribute little to its training view
     (Mini-Splatting2, Fang and Wang 2024).
 
-    The Gaussians with the largest weights that make up `weight_per_view` of a view's weight, alpha T over all pixels,
-    are kept.  New Gaussians are hidden in the same views as their source.  Other renders, and all renders after the
-    training, show every Gaussian.
+    The Gaussians with the largest weights, alpha T summed over pixels, stay visible, up to `weight_per_view` of the
+    view's total weight.  New Gaussians are hidden in the same views as their source.  Other renders, and all renders
+    after the training, show every Gaussian.
     """
 
     stage: Literal["hide_useless"] = "hide_useless"

@@ -234,7 +234,7 @@ def _random_arguments(draw: RandomKey | None) -> dict[str, int]:
 
 
 class Field:
-    """A field on the device, with a shape and parameters.  It renders views like Gaussians (clsplat.render.painter)."""
+    """A field on the device.  It renders views through the same interface as Gaussians (clsplat.render.painter)."""
 
     def __init__(self, shape: FieldShape, parameters: Array, background: Array) -> None:
         """parameters: [P], changed in place by training; background: [3] in [0, 1]."""

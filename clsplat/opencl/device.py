@@ -164,7 +164,7 @@ class Array:
                 cl.enqueue_copy(self.device.queue, self.buffer, host)
 
     def set_later(self, values: NDArray[Any]) -> None:
-        """Copy values of the same shape like `set`, but in the order of all commands, without waiting for them."""
+        """Copy values of the same shape from the host, as `set` does, but enqueue the copy without waiting for it."""
         host = np.array(values, self.dtype).reshape(self.shape)
         self.device.recording.spoil()
         with self.device.raising_errors("a copy to the device"):

@@ -120,9 +120,9 @@ def _short_version(version: str) -> str:
 def choose_device(device_name: str | None = None) -> DeviceInfo:
     """Choose a device, and log the devices that do not work.
 
-    `device_name` is a part of a runtime's or device's name, with `:n` for the n-th match, counted from 0.  The default
-    is the environment variable CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU, else the first
-    other device.  Raises DeviceError if no device matches or works.
+    `device_name` is a part of a runtime's or device's name; a suffix `:n` selects the n-th match, counted from 0.  The
+    default is the environment variable CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU, else the
+    first other device.  Raises DeviceError if no device matches or works.
     """
     device_name = device_name or os.environ.get(DEVICE_VARIABLE)
     devices = list_devices()

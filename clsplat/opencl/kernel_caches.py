@@ -32,7 +32,7 @@ def kernel_caches() -> str:
 
 
 def kernel_cache_advice() -> str:
-    """Return advice for a device that only works with empty kernel caches."""
+    """Return advice for a device that works only with empty kernel caches."""
     if fault := _full_cache_fault():
         return fault
     return f"its cache of built kernels is damaged: remove {kernel_caches()}"

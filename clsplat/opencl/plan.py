@@ -1,8 +1,8 @@
 """Plan the launches of a part of a step: bind kernels and arguments once, and then only enqueue them.
 
-A part is code that only launches kernels.  Its key determines all launches and arguments, except for some that change
-from step to step and are given by name.  The first run with a key allocates what the part needs, the second one records
-its launches, and later ones replay them.
+A part is code that only launches kernels.  Its key determines all launches and arguments, except for arguments
+that change from step to step and are given by name.  The first run with a key allocates what the part needs, the
+second one records its launches, and later ones replay them.
 """
 
 import weakref

@@ -83,8 +83,8 @@ def check_runtimes(loader: str) -> None:
 
     A success is recorded until the next boot, or until the runtimes change.
     loader: name and version of the OpenCL loader.
-    Raises DeviceError with the faulty driver file, MemoryLimitError if the address space is limited, and OutputError if
-    built kernels do not fit.
+    Raises DeviceError, which names the faulty driver file, MemoryLimitError if the address space is limited, and
+    OutputError if built kernels do not fit.
     """
     require_space()
     limit = process_limit("RLIMIT_AS")

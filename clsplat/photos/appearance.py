@@ -67,7 +67,7 @@ class ViewTable:
         return self.keys(self.views[0])[0] in scalars
 
     def begin(self, scalars: dict[str, float], rows: Mapping[str, Floats]) -> None:
-        """Set the rows of all views, to 0 for views without an entry in `rows`, then center the table."""
+        """Set each view's row to its values in `rows`, or to 0 if it has none; then center the table."""
         for view in self.views:
             values = rows.get(view, np.zeros(len(self.columns)))
             scalars.update(zip(self.keys(view), map(float, values), strict=True))
