@@ -1,6 +1,6 @@
 """Render images and videos, and write cameras.  Errors and `device` are as in `clsplat.api.commands`."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -34,7 +34,7 @@ def render_views(
 ) -> int:
     """Render a model at the views of a scene, and write one file per view.  Return the number of files.
 
-    model: a model file, which requires `scene`, or a run folder
+    model: a model file, or a run folder; a model file without `scene` is rendered once, from outside, to view.png
     scene: a dataset folder; default: the dataset of the run
     downscale: divisor of the image size; default: the downscale factor of the run, or 1 for a model file
     kind: "png" writes 8-bit images, "npy" float32 arrays, [height, width, 3]
@@ -44,14 +44,21 @@ def render_views(
     alpha: also write NAME_alpha, in [0, 1], as arrays [height, width]
     time: render a moving model at this time, in [0, 1], instead of at the times of the views
     """
-    from clsplat.runs.model_file import FORMATS, SPLITS, ModelFile
+    from clsplat.runs import video as videos
+    from clsplat.runs.model_file import FORMATS, SPLITS, ModelFile, is_model_alone
+    from clsplat.viewer.video.plan import VideoRequest
 
     load_plugins()
     for option, value, choices in (("split", split, SPLITS), ("kind", kind, FORMATS)):
         if value not in choices:
             raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
+    layers = layer_names(depth, normals, alpha)
+    if scene is None and split == "test" and downscale is None and is_model_alone(Path(model)):
+        target, request = videos.VideoTarget(None, Path(out), kind), VideoRequest.parse("fixed", 1, None, None, time)
+        extras = videos.VideoExtras(None, layers)
+        return len(videos.make_video(Path(model), None, target, request, extras, device=device)["files"])
     model_file = ModelFile(Path(model), to_path(scene), device, downscale)
-    return model_file.render(split, Path(out), kind, layer_names(depth, normals, alpha), time)
+    return model_file.render(split, Path(out), kind, layers, time)
 
 
 def render_path(
@@ -65,6 +72,8 @@ def render_path(
     fps: float | None = None,
     size: Size | None = None,
     times: "str | float | tuple[float, float] | None" = None,
+    position: "Sequence[float] | None" = None,
+    look_at: "Sequence[float] | None" = None,
     side: PathLike | None = None,
     depth: bool | Literal["mean", "median"] = False,
     normals: bool = False,
@@ -80,12 +89,15 @@ def render_path(
 
     model, scene: as for `render_views`
     video: a .webm file, or a .mp4 file if the extra `video` is installed; None writes images of this `kind` to `out`
-    path: ellipse, spiral, orbit, through, views, fixed, fixed:NAME with the name of a view, or a camera_path.json file
-    frames: 120 by default
+    path: ellipse, spiral, orbit, through, views, fixed, fixed:NAME with the name of a view, or a camera_path.json file;
+        a model file without a scene has orbit, ellipse, and fixed, with up at -y
+    frames: 120 by default; a single image of a fixed camera is named view.png
     fps: 30 by default
     size: width and height, which must be even; default: the image size divided by `downscale`
     times: for a moving model, one time in [0, 1], or the times of the first and last frame, such as (0, 1) or "0..1";
         default: the full range, or the times of the views
+    position, look_at: for the path `fixed`, the world coordinates, [3], of the camera and of the point to look at,
+        by default the focus of the scene
     side: what the right half shows: "photograph" for the photo of the nearest camera, or the path of another model
     depth, normals, alpha: also write videos of these layers, as in `render_views`
 
@@ -99,7 +111,7 @@ def render_path(
 
     load_plugins()
     request, target = (
-        VideoRequest.parse(str(path), frames, fps, size, times),
+        VideoRequest.parse(str(path), frames, fps, size, times, position, look_at),
         videos.VideoTarget(to_path(video), Path(out), kind),
     )
     extras = videos.VideoExtras(None if side is None else str(side), layer_names(depth, normals, alpha))

@@ -377,6 +377,13 @@ PathOption = Annotated[
     str | None,
     typer.Option(metavar="PATH", help="Video: ellipse, spiral, orbit, through, views, fixed[:VIEW], or a path file."),
 ]
+FromOption = Annotated[
+    str | None,
+    typer.Option("--from", metavar="X,Y,Z", help="One image from this position, or a video with a fixed camera."),
+]
+TargetOption = Annotated[
+    str | None, typer.Option("--look-at", metavar="X,Y,Z", help="With --from: look here; default: the center.")
+]
 SideOption = Annotated[
     str | None,
     typer.Option(metavar="photograph|MODEL", help="Video: show the nearest photo, or a model, next to the render."),
@@ -408,6 +415,8 @@ TimesOption = Annotated[
     "clsplat render point_cloud.ply --scene my_scene --split all --format npy",
     "clsplat render runs/splat_7k --depth median --normals",
     "clsplat render runs/splat_7k --video ellipse.webm --size 1280x720",
+    "clsplat render scan.ply --path orbit --video turntable.webm",
+    "clsplat render scan.ply --from 0,-1,3 --look-at 0,0,0",
     "clsplat render runs/a --path views --side photograph --video both.webm",
     "clsplat render runs/dynamic --path fixed --times 0..1 --video motion.webm",
 )
@@ -426,20 +435,26 @@ def render(
     fps: Annotated[float | None, typer.Option(metavar="F", help="Video: frames per second; default: 30.")] = None,
     size: SizeOption = None,
     file: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="Video file, .webm or .mp4.")] = None,
+    position: FromOption = None,
+    look_at: TargetOption = None,
     side: SideOption = None,
     time: TimeOption = None,
     times: TimesOption = None,
     device: DeviceOption = None,
 ) -> None:
-    """Render a model at the views of a scene, one image per view, or make a video along a camera path."""
+    """Render a model at the views of a scene, from anywhere, or as a video along a camera path."""
     if scale is not None and not math.isfinite(scale):
         raise ConfigError(f"--scale {scale}: expected a finite number of at least 1")
     if time is not None and times is not None:
         raise ConfigError("--time and --times cannot be combined; use --times A..B for a video")
-    if path is not None or file is not None:
+    if path is not None or file is not None or position is not None or look_at is not None:
         if split is not None:
             raise ConfigError("--split is for images of views; for a video of all views, use --path views")
         options: dict[str, Any] = {"path": path or "ellipse", "frames": frames, "fps": fps, "size": size, "side": side}
+        if position is not None:
+            options |= {"path": path or "fixed", "frames": frames or (1 if file is None else None)}
+        options["position"] = _parse_numbers("--from", position, "a position, such as 0,-1,2.5")
+        options["look_at"] = _parse_numbers("--look-at", look_at, "a position, such as 0,0,0")
         options["times"] = times if time is None else time
         options |= {"depth": depth or False, "normals": normals, "alpha": alpha, "downscale": scale, "kind": format_}
         result = rendering.render_path(model, scene, file, out=out, device=device, **options)

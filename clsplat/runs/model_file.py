@@ -132,6 +132,11 @@ class ModelSource:
         return masked_scene.with_alpha(self.alpha or model.rendering.alpha)
 
 
+def is_model_alone(path: Path) -> bool:
+    """Return whether a path is a file of Gaussians that no run exported, so that its scene is unknown."""
+    return model_file(path).is_file() and not is_field(path) and find_run(path) is None
+
+
 def require_model(path: Path) -> None:
     """Raise DataError if a path is a field file, or a folder without a model of Gaussians."""
     refuse_field(path)

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ from clsplat.viewer.video.paths import Floats, nearest_view
 from clsplat.viewer.video.plan import Side, VideoPlan, VideoRequest, layer_files, plan_video, render_video
 
 LOG = logging.getLogger("clsplat")
+STILL = "view"  # name of the only image of a fixed camera
 PHOTOGRAPH = "photograph"  # value of --side; any other value is a model
 
 
@@ -91,7 +92,9 @@ def make_video(
     if extras.side and not videos:
         raise ConfigError("--side needs --video, because images are written without a comparison; add --video FILE")
     content = _read(model)
-    used_scene = _scene(model, scene, content, downscale, is_required=not request.is_file or extras.side == PHOTOGRAPH)
+    is_alone = scene is None and find_run(model) is None and isinstance(content, Model)
+    needs_scene = request.needs_scene or not (request.is_file or is_alone)
+    used_scene = _scene(model, scene, content, downscale, is_required=needs_scene or extras.side == PHOTOGRAPH)
     origin = used_scene.origin if used_scene else content.origin
     content = content.in_scene(used_scene) if used_scene else content
     plan = plan_video(request, used_scene, content_points(content, used_scene), is_moving(content), origin)
@@ -100,7 +103,9 @@ def make_video(
     canvas = Canvas(make_painter(content, opened_device, background))
     if not videos:
         photo_files = [view.image_path for view in used_scene.views] if used_scene else []
-        files = write_renders(canvas, plan.views, target.out, target.kind, extras.layers, photo_files, is_video=True)
+        is_still = request.frames == 1 and request.path == "fixed"
+        views = [replace(plan.views[0], name=STILL)] if is_still else plan.views
+        files = write_renders(canvas, views, target.out, target.kind, extras.layers, photo_files, is_video=not is_still)
     else:
         side = _make_side(extras.side, plan, used_scene, background, opened_device, origin)
         render_video(canvas, plan, videos, side, lambda views: counted(views, "frames rendered", len(views)))

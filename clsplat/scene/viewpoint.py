@@ -20,6 +20,9 @@ PRIOR = 1e-3  # weight of the center of the splats, which determines the distanc
 START_CAMERA = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a scene without views
 QUANTILES = 0.05, 0.95  # of the splats along each axis: the faces of the box to look at
 DISTANCE = 2.2  # of the start view from the center of the box, in halves of its diagonal
+TOWARD_START = np.array([0.35, -0.25, -0.9])  # from the center
+MOST, MARGIN = 0.999, 1.05  # of the splats, which the start view shows as a whole, and their space
+MAX_ZOOM_OUT = 2.0  # times the distance; beyond it, the splats have a background, which is not framed
 
 
 @dataclass(frozen=True)
@@ -49,13 +52,39 @@ class Viewpoint:
         if first is None or not views:
             up = np.array([0.0, -1.0, 0.0])  # up in an OpenCV camera
             radius = spread or 1.0
-            eye = center + DISTANCE * radius * np.array([0.35, -0.25, -0.9])
-            return cls(center, up, radius, START_CAMERA.fx, View.looking_at(eye, center, up, START_CAMERA, "start"))
+            start = View.looking_at(center + DISTANCE * radius * TOWARD_START, center, up, START_CAMERA, "start")
+            distance = _distance_of_whole(start, means - center) if len(means) else 0.0
+            if DISTANCE * radius < distance <= MAX_ZOOM_OUT * DISTANCE * radius:
+                start = View.looking_at(center + distance * TOWARD_START, center, up, START_CAMERA, "start")
+            return cls(center, up, radius, START_CAMERA.fx, start)
         poses = np.stack([view.world_to_camera for view in views])
         centers = np.stack([view.position for view in views])
         pivot = nearest_to_axes(centers, poses[:, 2, :3], center)
         radius = float(np.median(np.linalg.norm(centers - pivot, axis=1))) or spread or 1.0
         return cls(pivot, up_direction(views), radius, float(np.median([view.camera.fx for view in views])), first)
+
+
+def _distance_of_whole(start: View, offsets: NDArray[np.floating]) -> float:
+    """Return the distance from the center at which `start` shows nearly all points, as multiples of TOWARD_START.
+
+    offsets: of the points from the center, [N, 3].
+    """
+    right, down, forward = start.world_to_camera[:, :3] @ offsets.T
+    camera = start.camera
+    sides = np.maximum(np.abs(right) * camera.fx / camera.cx, np.abs(down) * camera.fy / camera.cy)
+    return MARGIN * float(np.quantile(sides - forward, MOST)) / float(np.linalg.norm(TOWARD_START))
+
+
+def circle_views(points: NDArray[np.floating], count: int = 36) -> list[View]:
+    """Return views without photos around points, [N, 3]: a horizontal circle that begins at the viewer's start view."""
+    viewpoint = Viewpoint.from_points(points, (), None)
+    offset, views = viewpoint.start.position - viewpoint.pivot, []
+    for i, angle in enumerate(2 * np.pi * np.arange(count) / count):
+        cosine, sine = np.cos(angle), np.sin(angle)
+        turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])  # about y, which is up or down
+        eye = viewpoint.pivot + turn @ offset
+        views.append(View.looking_at(eye, viewpoint.pivot, viewpoint.up, START_CAMERA, f"circle_{i:02d}"))
+    return views
 
 
 def up_direction(views: Sequence[View]) -> NDArray[np.float64]:

@@ -178,6 +178,18 @@ def test_initial_camera_of_a_page(tmp_path):
     assert np.isfinite(Viewpoint.from_points(model.means, (), None).start.world_to_camera).all()
 
 
+def test_slim_model_alone_is_framed_whole():
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.normal(0, 0.05, 2000), rng.uniform(-1, 1, 2000), rng.normal(0, 0.05, 2000)])
+    start = Viewpoint.from_points(points, (), None).start
+    x, y, z = start.world_to_camera @ np.vstack([points.T, np.ones(2000)])
+    c = start.camera
+    assert ((c.fx * np.abs(x) / z < c.cx) & (c.fy * np.abs(y) / z < c.cy)).mean() > 0.998
+    background = np.concatenate([points, 100 * rng.normal(size=(50, 3))])
+    other = Viewpoint.from_points(background, (), None).start
+    assert np.linalg.norm(other.position) < 1.1 * np.linalg.norm(start.position), "a background is not framed"
+
+
 def test_camera_keeps_its_digits():
     view = views()[1]
     data = camera_data(view)

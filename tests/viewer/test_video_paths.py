@@ -219,7 +219,7 @@ def test_unknown_path_and_a_path_without_a_scene_are_refused():
     with pytest.raises(ConfigError, match="path 'elipse': expected one of ellipse, spiral, orbit, through, views"):
         VideoRequest.parse("elipse", None, None, None)
     with pytest.raises(ConfigError, match="needs the cameras of a scene"):
-        plan_video(VideoRequest(), None, np.zeros((1, 3)))
+        plan_video(VideoRequest("through"), None, np.zeros((1, 3)))
 
 
 def test_path_of_a_scene_in_python(rng):

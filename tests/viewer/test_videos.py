@@ -57,7 +57,7 @@ def test_path_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
     )
     assert (result["frames"], result["size"]) == (5, [32, 32])
     with pytest.raises(ConfigError, match="does not name its scene"):
-        clsplat.render_path(model, video=tmp_path / "a.webm")
+        clsplat.render_path(model, video=tmp_path / "a.webm", path="through")
 
 
 def test_path_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_path, caplog):
@@ -126,7 +126,7 @@ def test_sog_folder_with_a_path_file_needs_no_scene(few_steps, tiny_scene, tmp_p
     clsplat.render_path(tmp_path / "m" / "meta.json", video=tmp_path / "b.webm", **options)
     assert (tmp_path / "a.webm").read_bytes() == (tmp_path / "b.webm").read_bytes()
     with pytest.raises(ConfigError, match="does not name its scene"):
-        clsplat.render_path(tmp_path / "m", video=tmp_path / "a.webm")
+        clsplat.render_path(tmp_path / "m", video=tmp_path / "a.webm", path="views")
 
 
 def test_command_and_function_write_the_same_bytes(few_steps, tmp_path):
@@ -253,3 +253,34 @@ def test_invalid_video_is_refused_before_any_work(options, message, few_steps, t
     with pytest.raises((ConfigError, DataError), match=message):
         clsplat.render_path(few_steps, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_model_alone_is_rendered_from_outside(few_steps, tmp_path):
+    """A still, a turntable whose first frame is the still, and a camera at a given position."""
+    model = shutil.copy(few_steps / "point_cloud.ply", tmp_path / "scan.ply")
+    assert clsplat.render_views(model, out=tmp_path / "still") == 1
+    still = read_image(tmp_path / "still" / "view.png")
+    assert still.shape == (900, 1200, 3)
+    options = {"video": None, "size": (64, 48)}
+    clsplat.render_path(model, out=tmp_path / "a", path="fixed", frames=1, **options)
+    clsplat.render_path(model, out=tmp_path / "b", path="orbit", frames=4, **options)
+    first = read_image(tmp_path / "b" / "frame_00001.png").astype(int)
+    assert np.abs(first - read_image(tmp_path / "a" / "view.png")).mean() < 2
+    assert np.abs(first - read_image(tmp_path / "b" / "frame_00003.png")).mean() > 2
+    with pytest.raises(ConfigError, match="add --from"):
+        clsplat.render_path(model, out=tmp_path / "c", path="fixed", look_at=(0, 0, 0), **options)
+    with pytest.raises(ConfigError, match="expected x, y, and z"):
+        clsplat.render_path(model, out=tmp_path / "c", path="fixed", position=(0, 0), **options)
+
+
+def test_camera_is_where_it_was_requested(few_steps, tiny_scene):
+    scene, points = clsplat.read_scene(tiny_scene), clsplat.load(few_steps).means
+    options = {"position": (1.0, 2.0, 3.0), "target": (0.5, 0.0, 0.0)}
+    for used_scene in (scene, None):
+        plan = plan_video(VideoRequest.parse("fixed", 2, None, "64x48", **options), used_scene, points)
+        assert len(plan.views) == 2
+        for view in plan.views:
+            np.testing.assert_allclose(view.position, (1, 2, 3), atol=1e-9)
+            x, y, z = view.world_to_camera @ (0.5, 0, 0, 1)
+            np.testing.assert_allclose([x, y], 0, atol=1e-9)
+            assert z > 0

@@ -1,5 +1,6 @@
 """Choose the views of a video, and render them one after another."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from clsplat.formats.splats import is_timestamp
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
 from clsplat.scene.view_selection import ViewSelection
+from clsplat.scene.viewpoint import circle_views
 from clsplat.viewer.video import camera_path, encoding
 from clsplat.viewer.video.frames import DEPTH_LAYERS, LAYERS, Canvas, Image, layer_image, side_by_side
 from clsplat.viewer.video.paths import (
@@ -23,6 +25,7 @@ from clsplat.viewer.video.paths import (
     check_frames,
     check_size,
     even_size,
+    look_at_targets,
     repeat_view,
     same_area,
 )
@@ -80,6 +83,21 @@ Progress = Callable[[Sequence[View]], Iterable[View]]  # yields the views, and m
 Side = Callable[[View], Image]  # the image to the right of a view's render
 
 
+WITHOUT_SCENE = ("ellipse", "orbit", "fixed")  # paths that are possible for a model alone
+Position = tuple[float, float, float]
+
+
+def _check_position(option: str, position: Sequence[float] | None) -> Position | None:
+    """Return a position unchanged, or None.  Raises ConfigError unless it is 3 finite numbers."""
+    if position is None:
+        return None
+    if len(position) != 3 or not all(map(math.isfinite, position)):
+        raise ConfigError(
+            f"{option} {quote(tuple(position))}: expected x, y, and z in world coordinates, as in 0,-1,2.5"
+        )
+    return position[0], position[1], position[2]
+
+
 @dataclass(frozen=True)
 class VideoRequest:
     """The settings of a video, checked in advance; None means the default."""
@@ -89,6 +107,8 @@ class VideoRequest:
     fps: float | None = None
     size: Size | None = None
     times: Times | None = None  # for a moving scene
+    position: Position | None = None  # of the camera of the path `fixed`, in world coordinates
+    target: Position | None = None  # the point that it looks at; default: the focus of the scene
 
     @classmethod
     def parse(
@@ -98,6 +118,8 @@ class VideoRequest:
         fps: float | None,
         size: str | Size | None,
         times: str | float | Sequence[float] | None = None,
+        position: Sequence[float] | None = None,
+        target: Sequence[float] | None = None,
     ) -> "VideoRequest":
         """Parse the settings, and check everything that does not depend on the scene.  Raises ConfigError."""
         if path.partition(SEPARATOR)[0] not in PATHS and not path.lower().endswith(".json"):
@@ -106,13 +128,24 @@ class VideoRequest:
             )
         if SEPARATOR in path and path.partition(SEPARATOR)[0] in PATHS and not path.startswith(f"fixed{SEPARATOR}"):
             raise ConfigError(f"path {quote(path)}: only `fixed{SEPARATOR}NAME` accepts the name of a view")
+        if position is None and target is not None:
+            raise ConfigError("a point to look at was given without the position of the camera; add --from X,Y,Z")
+        if position is not None and path != "fixed":
+            raise ConfigError(f"path {quote(path)}: a camera at a given position is fixed; omit --path")
         return cls(
             path,
             None if frames is None else check_frames(frames),
             None if fps is None else check_fps(fps),
             None if size is None else check_size(size),
             parse_times(times),
+            _check_position("--from", position),
+            _check_position("--look-at", target),
         )
+
+    @property
+    def needs_scene(self) -> bool:
+        """Whether the path follows the cameras of a scene, so that it is impossible for a model alone."""
+        return not self.is_file and self.path not in WITHOUT_SCENE
 
     @property
     def is_file(self) -> bool:
@@ -145,6 +178,7 @@ def plan_video(
     """Plan the video of a scene.  points: [M, 3], means of a model, or points of the scene.
 
     is_moving: whether the model moves; origin: the points' origin, [3] world coordinates; default: the scene's origin.
+    Without a scene, the paths ellipse, orbit, and fixed circle around the points, with up at -y.
     Raises ConfigError if the path needs a scene and there is none, or if times are set without motion, and DataError if
     the path is impossible in the scene.
     """
@@ -159,13 +193,20 @@ def _plan_path(request: VideoRequest, scene: Scene | None, points: Floats, origi
         views = camera_file.resized(request.size) if request.size else camera_file.views
         views = views if origin is None else [view.shifted(origin) for view in views]  # files have world coordinates
         return VideoPlan(camera_path.resample(views, request.frames or len(views)), request.fps or camera_file.fps)
-    if scene is None:
+    if scene is None and request.needs_scene:
         raise ConfigError(
             f"the path {request.path} needs the cameras of a scene; pass --scene, a run folder, or a path file"
         )
-    rig = Rig.from_views(scene.views, points)
+    rig = Rig.from_views(scene.views if scene else circle_views(points), points)
     size = request.size or even_size(rig.camera)
-    if SEPARATOR in request.path:
+    if request.position is not None:
+        offset = np.zeros(3) if origin is None else origin
+        target = rig.focus if request.target is None else request.target - offset
+        views = look_at_targets(request.position - offset[None], target[None], rig.up[None], rig, size)
+        return VideoPlan(repeat_view(views[0], request.frames or FRAMES, size), request.fps or FPS)
+    if scene is None and request.path == "fixed":
+        return VideoPlan(repeat_view(rig.views[0], request.frames or FRAMES, size), request.fps or FPS)
+    if scene and SEPARATOR in request.path:
         names = [view.name for view in scene.views]
         (index,) = ViewSelection(names=[request.path.partition(SEPARATOR)[2]]).select(names, [])
         return VideoPlan(repeat_view(scene.views[index], request.frames or FRAMES, size), request.fps or FPS)
