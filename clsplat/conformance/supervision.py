@@ -54,7 +54,7 @@ def run_checks(
     """Run checks on a device with a schedule, and yield each result when it is complete.
 
     A check without output for `seconds` is stopped.  A check that cannot be completed is repeated with empty caches of
-    built kernels.  After the first repetition that also fails, no more checks are repeated.
+    built kernels.  If that repetition also fails, later checks are not repeated.
     """
     remaining, retry = list(checks), True
     while remaining:

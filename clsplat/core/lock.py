@@ -51,7 +51,7 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
     """Return the owner in a lock file if it is on another machine, whose lock may be invisible here; otherwise {}.
 
     Machines may share a name, so boot IDs are compared where both are known.
-    Raises OutputError if the heartbeat in the run's status next to the file is recent.
+    Raises OutputError if the heartbeat in the run's status, a file next to the lock file, is recent.
     """
     owner = read_owner(file)
     holder, local = Owner.from_record(owner), Owner.current()

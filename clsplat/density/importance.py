@@ -106,7 +106,7 @@ class SampledPruning(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"share", "opacity_below", "size_above"})
 
     share: Share = 0.5
-    """Fraction of the faint and large Gaussians that is removed."""
+    """Fraction of the faint and the large Gaussians to remove."""
     opacity_below: Positive = 0.005
     """Opacity below which a Gaussian is faint; may be scheduled."""
     size_above: Positive = 0.1

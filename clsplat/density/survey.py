@@ -75,8 +75,8 @@ class RenderedView:
     def sum(self, index: int, plane: NDArray[Any] | None = None, channel: int | None = None) -> Floats:
         """Return a sum over pixels for each Gaussian, [N]; 0 if it is not visible.
 
-        index: `SUM_*` in cl_kernels/splat.h.  plane: the texture, [height, width], 0 or more; None for 0.  channel:
-        index of the image channel whose sum over the image is the loss to differentiate; None for no loss.
+        index: `SUM_*` in cl_kernels/splat.h.  plane: the texture, [height, width], at least 0; None for zeros.
+        channel: index of the image channel whose sum over the image is the loss to differentiate; None for no loss.
         """
         camera, counted_mask = self.photograph.camera, self.counted_pixels()
         texture = np.full((camera.rows, camera.stride), -1, np.float32)  # -1: the pixel does not count
@@ -148,7 +148,7 @@ class Survey:
 
 
 def normalize(values: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Scale values linearly so that those in the mask range from 0 to 1; return 0 if they are all equal."""
+    """Scale values linearly so that those in the mask range from 0 to 1; return zeros if they are all equal."""
     low = float(np.min(values[mask], initial=np.inf))
     high = float(np.max(values[mask], initial=-np.inf))
     return (values - low) / (high - low) if high > low else np.zeros_like(values)

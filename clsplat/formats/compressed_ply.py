@@ -1,6 +1,6 @@
 """Read the compressed PLY of PlayCanvas: 16 bytes per splat, plus 3(K-1) for SH, in chunks of 256 splats.
 
-chunk   min and max of x y z, scale_x y z, and r g b, float32; old files have no r g b: 0 and 1
+chunk   min and max of x y z, scale_x y z, and r g b, float32; without r g b (old files), colors range from 0 to 1
 vertex  packed_position   x << 21 | y << 11 | z    11, 10, and 11 bits within the chunk's range
         packed_rotation   index of the largest of w x y z << 30, the others 10 bits each of c / sqrt 2 + 1/2
         packed_scale      log scales, packed like the position;    packed_color   r << 24 | g << 16 | b << 8 | opacity

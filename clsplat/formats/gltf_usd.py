@@ -260,7 +260,7 @@ class Gltf:
         return meshes
 
     def _matrix(self, index: int) -> NDArray[np.float64]:
-        """Return the transform of a node, [4, 4].  Raises DataError for a quaternion without a direction."""
+        """Return the transform of a node, [4, 4].  Raises DataError for a zero or non-finite quaternion."""
         node = self.tree["nodes"][index]
         if "matrix" in node:
             return np.array(node["matrix"], np.float64).reshape(4, 4).T
