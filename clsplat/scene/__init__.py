@@ -1,4 +1,4 @@
-"""Datasets on the host.  A reader for another format needs these names; see `Reader`."""
+"""Datasets in host memory.  This module exports the names that a reader for another format needs; see `Reader`."""
 
 from clsplat.core.reading import read_file as read_file
 from clsplat.scene.camera import Camera as Camera

@@ -209,7 +209,7 @@ class _BinaryFile:
         return struct.unpack_from(layout, self.data, self.skip(struct.calcsize(layout), label))
 
     def read_count(self, stride: int, label: str) -> int:
-        """Read the number of records, and check that the file can hold records of at least `stride` bytes."""
+        """Read the number of records, and check that the file can hold that many records of at least `stride` bytes."""
         (count,) = self.read("<Q", f"the number of {label}")
         self.offset = self.skip(count * stride, f"{count} {label}")
         return int(count)
@@ -317,7 +317,9 @@ logger = logging.getLogger("clsplat")
 class ColmapReader(Reader):
     """A COLMAP scene: models in `sparse/N`, `sparse` or the folder itself, photographs in `images`.
 
-    If there are several models, the one with the most images is used.  Every `holdout`-th view by name is a test view.
+    If there are several models, the one with the most images is used.  Every `holdout`-th view in order of name is a
+    test view.
+
     Photographs of cameras with distortion are undistorted when they are read.  The folder `masks` may contain masks,
     named like the images, with .png appended or as the suffix.  With a file `images/times.json` that lists the time of
     each image, the scene is dynamic.

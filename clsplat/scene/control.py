@@ -190,7 +190,7 @@ def _parse_number(source: str, name: str, text: str | None) -> float:
 
 @dataclass(frozen=True)
 class ScaleBar:
-    """A known distance between two points, which are coordinates or marked points."""
+    """A known distance between two points, each given by its coordinates or by marks in photos."""
 
     text: str
     ends: tuple[Floats | MarkedPoint, Floats | MarkedPoint]

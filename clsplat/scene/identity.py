@@ -199,7 +199,7 @@ class Identity:
 
     @property
     def digest(self) -> str:
-        """The hash of everything that affects the bits of a run.  The order of the test views has no effect on it."""
+        """The hash of everything in the scene that affects the bits of a run.  Test views may be in any order."""
         values = [list(self.train.items()), sorted(self.test.items()), self.points]
         values += [list(self.validation.items())] if self.validation else []
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

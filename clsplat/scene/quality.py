@@ -105,7 +105,7 @@ def measure_sharpness(path: Path) -> NDArray[np.float64]:
 
 
 def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool:
-    """Return whether both sharpness values of a photograph are far below the medians of a set, [2].
+    """Return whether both sharpness values of a photograph are far below the medians of a set of photographs, [2].
 
     The first value is also small for a dark photograph, the second for a bright photograph among dark ones.
     """

@@ -52,7 +52,7 @@ class Parts:
             return None
 
     def expect(self, files: FileLookup) -> None:
-        """Add the files that the dataset refers to, with a note about inexact matches."""
+        """Add the files that the dataset refers to to `expected_files`, and a note about inexact matches to `notes`."""
         self.expected_files += files.paths
         self.notes += [files.note] if files.note else []
         self.hint = files.hint
@@ -105,7 +105,7 @@ class Reader(ABC):
         """
 
     def list_parts(self, parts: Parts) -> None:
-        """Add the readable parts of a possibly damaged dataset to `parts`; by default, the parts of its scene."""
+        """Add the readable parts of a possibly damaged dataset to `parts`; by default, those of `parts.scene`."""
         scene = parts.scene
         if scene is not None:
             parts.views = list(scene.views)

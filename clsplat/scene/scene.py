@@ -148,7 +148,7 @@ class Scene:
         return replace(self, train=tuple(sorted(self.train + self.validation)), validation=())
 
     def renamed(self, names: Sequence[str]) -> "Scene":
-        """Return the scene with `names` as the names of its views, in their order."""
+        """Return the scene with renamed views.  names: the new name of each view, in the order of the views."""
         views = tuple(replace(view, name=name) for view, name in zip(self.views, names, strict=True))
         new_names = {view.name: name for view, name in zip(self.views, names, strict=True)}
         return replace(self, views=views, tracks=self.tracks and self.tracks.renamed(new_names))
@@ -189,14 +189,14 @@ class Scene:
 
     @property
     def image_sizes(self) -> str:
-        """The three most frequent image sizes in pixels, as in `800x600 and 600x800`."""
+        """The three most frequent image sizes in pixels, as text such as `800x600 and 600x800`."""
         sizes = Counter(f"{view.camera.width}x{view.camera.height}" for view in self.views)
         *first_sizes, last = [size for size, _ in sizes.most_common(3)] + (["others"] if len(sizes) > 3 else [])
         return f"{', '.join(first_sizes)} and {last}" if first_sizes else last
 
     @property
     def cameras(self) -> dict[str, str]:
-        """The name of the camera of each view, by view name: the first view with an equal lens or camera."""
+        """The name of each view's camera, by view name: that of the first view with an equal lens or camera."""
         first_names: dict[object, str] = {}
         return {view.name: first_names.setdefault(view.lens or view.camera, view.name) for view in self.views}
 

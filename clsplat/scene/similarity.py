@@ -152,9 +152,9 @@ def fit_without_outliers(
 ) -> tuple[Fit, NDArray[np.bool_]]:
     """Return a fit to the inliers among `count` observations, and a mask of the outliers, [count].
 
-    The start is the least median of squares (Rousseeuw 1984) of fits to `minimum` observations each.  Fewer than
-    minimum + 2 observations are all inliers, because an outlier cannot be distinguished.  floor: the distance below
-    which no observation is an outlier.
+    The iteration starts at the fit to `minimum` observations with the least median of squares (Rousseeuw 1984).
+    Fewer than minimum + 2 observations are all inliers, because an outlier cannot be distinguished.  floor: the
+    distance below which no observation is an outlier.
     """
     all_rows = np.arange(count)
     if count < minimum + 2:
@@ -175,7 +175,7 @@ def fit_without_outliers(
 
 
 def _samples(count: int, size: int) -> Iterable[NDArray[np.intp]]:
-    """Return all subsets of `size` numbers below `count`, or MAX_SAMPLES random ones; the same in each call."""
+    """Return all subsets of `size` numbers below `count`, or MAX_SAMPLES random subsets, the same in each call."""
     if comb(count, size) <= MAX_SAMPLES:
         return map(np.array, combinations(range(count), size))
     rng = np.random.default_rng(0)

@@ -71,7 +71,7 @@ def camera_key(view: View) -> bytes:
 
 
 def group_by_camera(views: Sequence[View]) -> list[list[View]]:
-    """Return a list for each fixed camera with its views in order of time."""
+    """Return a list of the views of each fixed camera, in order of time."""
     groups: dict[bytes, list[View]] = {}
     for view in views:
         groups.setdefault(camera_key(view), []).append(view)

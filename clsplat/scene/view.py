@@ -289,7 +289,7 @@ def load_mask(view: View) -> NDArray[np.bool_] | None:
 
 
 def _read_original(view: View, path: Path, channels: slice = slice(None)) -> NDArray[Any]:
-    """Return some channels of a file, rotated to fit the camera, undistorted, and not downscaled.
+    """Return some channels of a photograph or mask, rotated to fit the camera and undistorted, but not downscaled.
 
     Raises DataError when the file cannot be read or does not fit the camera.
     """

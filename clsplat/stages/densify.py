@@ -34,7 +34,8 @@ class Densify(Scheduled):
     step_keys: ClassVar[frozenset[str]] = frozenset({"grow_until"})
 
     rules: list[OneOf[Rule]]
-    """Rules that grow or remove Gaussians; the first growing rule applies, and pruning rules override growth."""
+    """Rules that grow or remove Gaussians.  The first growth rule that selects a Gaussian applies; pruning rules take
+    precedence."""
     max_gaussians: AtLeastOne | None = None
     """Number of Gaussians at which growth stops; pruning continues.  Default: as many as fit in memory.  With `inside`,
     only Gaussians in the box count."""

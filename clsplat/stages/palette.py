@@ -151,7 +151,7 @@ class VisibleError:
     def from_views(
         cls, views: Iterable[tuple[RenderedView, NDArray[np.floating]]], means: NDArray[np.floating], coefficients: int
     ) -> "VisibleError":
-        """Accumulate A over `views`, pairs of a render and a camera center, [3].  means: [N, 3] scene units."""
+        """Accumulate A over `views`: pairs of a render and a camera center, [3].  means: [N, 3] in scene units."""
         i, j = np.triu_indices(coefficients)
         weights, first = np.zeros(len(means)), np.zeros((coefficients, len(means)))
         second = np.zeros((len(i), len(means)))
@@ -189,7 +189,7 @@ class VisibleError:
     def improve_palette(
         self, sh_rest: NDArray[np.float32], vectors: Floats, *, nearest: Nearest
     ) -> tuple[Floats, NDArray[np.int64]]:
-        """Return a palette's vectors, [E, 3 K], improved to less visible errors, and the label of each Gaussian, [N].
+        """Return a palette's vectors, [E, 3 K], optimized for less visible errors, and the label of each Gaussian, [N].
 
         This is Lloyd's iteration with the quadratic form of each Gaussian as its distance.  nearest: returns for
         points, [N, c], the index of the vector, [E, c], with the largest dot product.  Unused vectors do not change.
@@ -214,7 +214,7 @@ class VisibleError:
         return points
 
     def _optimal_vectors(self, products: Floats, labels: NDArray[np.int64], vectors: Floats) -> Floats:
-        """Return the optimal vector for the Gaussians of each label.  Sums are in the order of the Gaussians."""
+        """Return the optimal vector for the Gaussians of each label.  Sums are computed in Gaussian order."""
         entries, size = len(vectors), self.mean.shape[1]
         i, j = np.triu_indices(size)
         form, right_sides = np.empty((entries, size, size)), np.empty(vectors.shape)

@@ -97,7 +97,7 @@ class Dispatcher:
     bits: str | None = None  # chosen bits class of all cells; None: not chosen yet, or `is_same` is False
     _last_available: float = field(default_factory=time.monotonic)  # when a device of that class was last available
     _unsuitable: tuple[list[DeviceSlot], set[DeviceSlot]] = field(default_factory=lambda: ([], set()))
-    """All devices, and the devices on which no pending cell can run."""
+    """The devices of the last assignment, and those of them on which no pending cell can run."""
     _running: dict[DeviceSlot, tuple[PendingCell, CellRun, Ticket]] = field(default_factory=dict)
 
     def run(self, cells: Sequence[PendingCell]) -> None:

@@ -185,7 +185,7 @@ class CellAttempt:
         return math.inf
 
     def continue_from(self, others: Iterable["CellAttempt"]) -> None:
-        """Copy the attempt with the newest readable checkpoint into this folder, by hard links if possible.
+        """Copy the newest readable checkpoint and the other files of its attempt, by hard links if possible.
 
         Damaged checkpoints are skipped.  Raises OutputError.
         """
