@@ -102,12 +102,12 @@ class Viewer extends Walk {
     document.documentElement.dataset.ready = "1";
   }
 
-  // Rotate about the nearest splat that covers a pixel of the stage.
+  // Rotate about the nearest splat that covers a pixel of the stage, and measure its distance from the previous one.
   focus(x, y) {
     const {width, height} = this.pane(), [u, v] = [x % width, y % height], [layer] = this.layers;
     const frame = framed(this.camera, width, height, false), rows = [0, 1, 2].map(i => axis(this.camera, i));
     const [fx, fy, cx, cy] = frame.intrinsics, {motion} = layer;
-    let nearest = Infinity;
+    let nearest = Infinity, hit;
     for (let i = 0; i < layer.count; i++) {
       const point = [layer.points[4 * i], layer.points[4 * i + 1], layer.points[4 * i + 2]];
       const dt = motion ? this.moment - motion.rows[i * motion.stride + 3] : 0;
@@ -117,8 +117,12 @@ class Viewer extends Walk {
       if (layer.opacities[i] * (motion ? presence(motion, i, dt) : 1) < 0.4) continue;
       const across = fx * (dot(rows[0], point) + frame.translation[0]) / depth + cx - u;
       const down = fy * (dot(rows[1], point) + frame.translation[1]) / depth + cy - v;
-      if (across * across + down * down < 64) [nearest, this.pivot] = [depth, point];
+      if (across * across + down * down < 64) [nearest, hit] = [depth, point];
     }
+    if (!hit) return;
+    this.distance = this.hit && size(add(hit, this.hit, -1));
+    this.pivot = this.hit = hit;
+    this.change(false);
   }
 
   // Save the current image as a file.

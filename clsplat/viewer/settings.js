@@ -46,6 +46,7 @@ class Settings extends Panel {
       (faint ? ` + ${thousands(faint)} too faint to draw` : ""));
     if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
     if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);
+    if (this.viewer.distance) parts.push(`distance of the last two points: ${this.viewer.distance.toPrecision(4)}`);
     find("statistics").textContent = parts.join(" · ");
   }
 }

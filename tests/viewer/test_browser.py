@@ -324,6 +324,24 @@ def test_two_models_share_a_camera(browser, tmp_path):
     assert browser.run("document.getElementById('strip')") is None, "there are no views"
 
 
+def test_double_clicks_measure_a_distance(browser, tmp_path):
+    model = cloud(2)
+    model.means[:], model.logit_opacity[:], model.log_scales[:] = [[-0.5, 0, 0], [0.7, 0.1, 0.3]], 4, -3
+    Page("two", {"a": pack(model)}, Viewpoint.from_points(model.means, (), None), "black").write(tmp_path / "page.html")
+    browser.open(tmp_path / "page.html")
+    assert browser.run("viewer.focus(1, 1)") is None, "nothing is there"
+    distance = browser.run(
+        "(() => { const {width, height} = viewer.pane();"
+        " for (let x = 0; x < width; x += 6) for (let y = 0; y < height; y += 6)"
+        " if (!viewer.distance) viewer.focus(x, y); return viewer.distance; })()"
+    )
+    assert distance == pytest.approx(np.linalg.norm(model.means[0] - model.means[1]), rel=1e-3)
+    browser.run("viewer.draw(true)")
+    assert f"distance of the last two points: {distance:.4g}" in browser.run(
+        "document.getElementById('statistics').textContent"
+    )
+
+
 def test_empty_and_damaged_models(browser, tmp_path):
     stand = Viewpoint.from_points(cloud(4)[:0].means, (), None)
     page = tmp_path / "page.html"
