@@ -40,7 +40,7 @@ def synthetic(
 def photos(
     source: Annotated[Path, typer.Argument(help="Folder of photos; nothing is written to it.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scene; finished steps in it are not repeated.")],
-    long_side: Annotated[int, typer.Option(min=64, help="Image size for features: pixels of the long side.")] = 1600,
+    long_side: Annotated[int, typer.Option(min=64, help="Long side in px of the images for feature detection.")] = 1600,
     camera_model: Annotated[CameraModel, typer.Option(help="Camera model of COLMAP.")] = "SIMPLE_RADIAL",
     matching: Annotated[Matching, typer.Option(help="Which pairs of photos to match.")] = "auto",
     mapper: Annotated[Mapper, typer.Option(help="Mapping method.")] = "incremental",

@@ -197,13 +197,13 @@ def align(
     ],
     scene: SceneOption = None,
     level: Annotated[
-        Literal["cameras", "ground"] | None, typer.Option(help="Turn the scene upright; where up comes from.")
+        Literal["cameras", "ground"] | None, typer.Option(help="Turn the scene upright, by its cameras or ground.")
     ] = None,
     distance: Annotated[
         list[str] | None,
         typer.Option(
             metavar="A;B=LENGTH",
-            help="A known distance; A and B: x,y,z, or PHOTO:u,v+PHOTO:u,v, or names in --control; may be repeated.",
+            help="A known distance; A and B: x,y,z, PHOTO:u,v+PHOTO:u,v, or a name in --control; may be repeated.",
         ),
     ] = None,
     gps: Annotated[bool, typer.Option("--gps", help="Use GPS positions in EXIF; coordinates become UTM.")] = False,
@@ -342,7 +342,7 @@ def mesh(
     ] = None,
     keep: Annotated[float, typer.Option(metavar="F", help="Fraction of the faces to keep.")] = 1.0,
     collision: Annotated[
-        bool, typer.Option("--collision", help="Write a closed hull of what no two views see as free space.")
+        bool, typer.Option("--collision", help="Write a closed hull of all space that no two views see as free.")
     ] = False,
     scale: ScaleOption = None,
     device: DeviceOption = None,

@@ -267,7 +267,7 @@ def blocks(
     ] = 0.05,
     steps: Annotated[
         Literal["each", "shared"],
-        typer.Option(help="Steps per block: as in the pipeline, or proportional to its number of views."),
+        typer.Option(help="Steps per block: as in the pipeline, or proportional to the number of views of the block."),
     ] = "each",
     plan: Annotated[bool, typer.Option("--plan", help="Only train the coarse model and show the plan.")] = False,
     set_: SetOption = None,

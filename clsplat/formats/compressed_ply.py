@@ -78,7 +78,7 @@ def _require_match(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]
     chunks, vertices = tables["chunk"], tables["vertex"]
     if len(chunks) * CHUNK < len(vertices):
         raise DataError(
-            f"{path}: {len(chunks)} chunks for {len(vertices)} splats; expected one per {CHUNK} splats; export it again"
+            f"{path}: has {len(chunks)} chunks for {len(vertices)} splats; expected one per {CHUNK}; export it again"
         )
     return chunks, vertices
 

@@ -219,7 +219,7 @@ def _bucket_centers(path: Path, data: bytes, start: int, section: SplatSection) 
     partial = np.frombuffer(data, "<u4", section.partial_buckets, start).astype(np.int64)
     full_count = section.full_buckets * section.bucket_size
     if full_count + int(partial.sum()) < section.count or full_count > section.rows:
-        raise DataError(f"{path}: its buckets have fewer splats than the {section.count} declared; copy the file again")
+        raise DataError(f"{path}: its buckets contain fewer than the declared {section.count} splats; copy it again")
     counts = np.concatenate([np.full(section.full_buckets, section.bucket_size), np.minimum(partial, section.count)])
     ends = np.minimum(np.cumsum(counts), section.count)
     bucket = np.repeat(np.arange(len(counts)), np.diff(ends, prepend=0))

@@ -352,7 +352,7 @@ def require_static(path: Path, splats: SplatFile, name: str) -> None:
     if MOTION in splats.parameters:
         raise DataError(
             f"{path}: {name} cannot store moving Gaussians; write a PLY, or a single frame: `clsplat convert "
-            "MODEL OUT --time T`, `--frames N` for several, or `model.at(time)`"
+            "MODEL OUT --time T` (`--frames N` for several), or `model.at(time)` in Python"
         )
 
 

@@ -441,7 +441,7 @@ def _decode_version_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, s
     """Decode the header, parameters, and declared axes of version 4."""
     header = SpzHeader.parse(path, data)
     if len(data) < HEADER4:
-        raise DataError(f"{path}: has {len(data)} bytes; expected a header of {HEADER4}; copy or export it again")
+        raise DataError(f"{path}: has {len(data)} bytes; expected {HEADER4} bytes of header; copy or export it again")
     stream_count, table_start = struct.unpack_from("<BI", data, HEADER - 1)
     sizes = [size for size in header.sizes if size]
     if stream_count != len(sizes) or not HEADER4 <= table_start <= len(data) - 16 * stream_count:

@@ -227,7 +227,7 @@ def log_color_metrics(averages: dict[str, Any]) -> None:
         return
     psnr_color, reason = averages["psnr_color"], averages.get("psnr_color_reason")
     if psnr_color is None:
-        LOG.warning("no PSNR in the photos' colors: %s", reason)
+        LOG.warning("PSNR in the photos' colors cannot be measured: %s", reason)
     elif reason:
         LOG.warning(
             "in the photos' colors: PSNR %.2f dB, the mean of %s: %s",
@@ -363,7 +363,7 @@ def measure(
             empty_names.append(view.name)
     if empty_names:
         LOG.warning(
-            "almost nothing is rendered in %d of %s, such as %s; check that model and cameras match, and model.near",
+            "almost nothing is rendered in %d of %s, such as %s; check model.near, and that model and cameras match",
             *(len(empty_names), pluralize(len(views), "view"), quote(empty_names[0])),
         )
     flicker, psnrs = flicker_meter.flicker(), {result.view: result.psnr for result in results}

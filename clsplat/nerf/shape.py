@@ -46,7 +46,7 @@ class GridShape(Settings):
         if self.finest < self.coarsest:
             raise ValueError(f"'finest' must be at least 'coarsest', {self.coarsest}; got {self.finest}")
         if self.levels == 1 and self.finest != self.coarsest:
-            raise ValueError("with one level, 'coarsest' and 'finest' must be equal; or use at least 2 levels")
+            raise ValueError("'coarsest' and 'finest' must be equal with one level; or use at least 2 levels")
         if self.entries & (self.entries - 1):
             raise ValueError(f"'entries' must be a power of 2, got {self.entries}")
         return self

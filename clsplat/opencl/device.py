@@ -450,7 +450,7 @@ class Kernel:
         if items > limit and not underreports_group_limit(device.info, limit, group_multiple(kernel, cl_device)):
             raise KernelError(
                 f"{label} needs work-groups of {items} items, but {device.info.text} allows {limit}; "
-                "use another device, rasterizer.schedule or rasterizer.sort"
+                "use another device, rasterizer.schedule, or rasterizer.sort"
             )
 
     def take(self) -> Any:

@@ -119,7 +119,7 @@ class Execution(LocalExecution):
             raise ValueError(f"{self.engine}: expected tls:// for another machine, or insecure: true (--insecure)")
         if self.engine.startswith("tls://") and self.tls is None:
             raise ValueError(
-                f"{self.engine}: expected tls: {{ca: …, cert: …, key: …}} (--tls-ca, --tls-cert and --tls-key)"
+                f"{self.engine}: expected tls: {{ca: …, cert: …, key: …}} (--tls-ca, --tls-cert, and --tls-key)"
             )
         return self
 

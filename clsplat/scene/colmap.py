@@ -410,7 +410,7 @@ def _read_largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     models = [(folder, read_images(folder)) for folder in find_models(path)]
     if not models:
         raise DataError(
-            f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in sparse/0, sparse, or that folder"
+            f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in it, sparse, or sparse/0"
         )
     best = max(models, key=lambda model: len(model[1]))
     if unused_models := ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0]):

@@ -170,7 +170,7 @@ def read_control(path: Path) -> dict[str, MarkedPoint]:
                 coordinates = (x, y, z)
             old = points.get(name, MarkedPoint(name))
             if coordinates and old.coordinates and coordinates != old.coordinates:
-                raise DataError(f"{source}: point {quote(name)} has other coordinates in an earlier row; correct one")
+                raise DataError(f"{source}: point {quote(name)} has other coordinates in an earlier row; fix one row")
             mark = Mark(photo, (pixel[0], pixel[1]))
             points[name] = MarkedPoint(name, (*old.marks, mark), coordinates or old.coordinates)
     except csv.Error as error:

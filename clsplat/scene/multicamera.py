@@ -97,7 +97,7 @@ def _frames(path: Path) -> dict[str, list[Path]]:
     if empty_names:
         raise DataError(
             f"{path / VIDEOS}: {len(empty_names)} of {len(entries)} cameras have no frames: {first_few(empty_names)}; "
-            "expected images in each folder: add them, or remove the folder"
+            "expected images in each folder: add them, or remove the empty folders"
         )
     counts = {name: len(files) for name, files in frames.items()}
     short, long = (select(counts, key=counts.__getitem__) for select in (min, max))

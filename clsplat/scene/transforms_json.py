@@ -81,9 +81,7 @@ class JsonFrame:
         """Return the path of the image, in the form of a view name.  Raises DataError when the frame has no path."""
         name = self.file_name("file_path")
         if name is None:
-            raise DataError(
-                f"{self.source}: it has no `file_path`; expected the path of an image: export the file again"
-            )
+            raise DataError(f"{self.source}: has no `file_path`; expected the path of an image: export the file again")
         return name
 
 

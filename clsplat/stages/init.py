@@ -66,7 +66,7 @@ def try_sweep(run: Run, count: int) -> PointCloud | None:
     points = sweep_photos(run, count)
     if len(points) < MIN_USABLE:
         remedy = "photos taken closer together give more"
-        LOG.warning("the plane sweep found only %d points; starting from random ones; %s", len(points), remedy)
+        LOG.warning("the plane sweep found only %d points; starting from random points; %s", len(points), remedy)
         return None
     return points
 
@@ -76,7 +76,7 @@ def sample_hull(run: Run, count: int) -> PointCloud | None:
     points = hull_points(_training_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
     if len(points) < MIN_USABLE:
         remedy = "it needs photos with a transparent background and no mask files; otherwise, use init: {source: sweep}"
-        LOG.warning("the visual hull has only %d points; starting from random ones; %s", len(points), remedy)
+        LOG.warning("the visual hull has only %d points; starting from random points; %s", len(points), remedy)
         return None
     return points
 

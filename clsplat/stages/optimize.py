@@ -62,8 +62,8 @@ class ValidatedTraining(Training):
             raise ValueError("'densify.patience' needs 'keep: best'; set both or neither")
         if self.keep == "best" and any(stage.stage == "average" for stage in self.during):
             raise ValueError(
-                "'keep: best' keeps the model of one step, not an average; remove one of them, or use a pipeline "
-                "without 'average', such as splat_7k"
+                "'keep: best' keeps the model of one step, not an average; remove `keep` or `average`, or use a "
+                "pipeline without 'average', such as splat_7k"
             )
         return self
 

@@ -183,9 +183,9 @@ class Targets:
             row = Residual(name, positions[i].tolist(), error.tolist(), distance, bool(is_outlier[i]), self.marks[i])
             residuals.append(row)
             if row.is_outlier:
-                LOG.warning("%s: is an outlier, %.3g from its known position; it is not used", name, distance)
+                LOG.warning("%s: is an outlier, %.3g from its known position, and is not used", name, distance)
             for mark in (mark for mark in row.marks if mark.is_outlier):
-                LOG.warning("%s: its mark in %s is %.3g px off; it is not used", name, mark.mark.photo, mark.error)
+                LOG.warning("%s: its mark in %s is %.3g px off, and is not used", name, mark.mark.photo, mark.error)
         return residuals
 
 

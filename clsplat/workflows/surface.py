@@ -169,7 +169,7 @@ def reduce(mesh: Mesh, keep: float) -> Mesh:
     colors = mesh.colors[cKDTree(mesh.vertices).query(points)[1]]
     reduced = split_edges(Mesh(points, np.asarray(faces, np.int64), colors))
     if mesh.is_closed and not reduced.is_closed:
-        LOG.warning("with %.3g of its faces, the surface would not stay closed; keeping more", keep)
+        LOG.warning("with %.3g of its faces, the surface would not stay closed; more faces are kept", keep)
         return reduce(mesh, keep * MORE_FACES)
     return reduced
 

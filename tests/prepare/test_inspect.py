@@ -223,7 +223,7 @@ def test_damaged_frames_are_named_one_by_one(tiny_scene, tmp_path):
     faults = [finding.text for finding in inspection.findings if finding.level == "error"]
     assert len(faults) == 2
     assert "frames[1]: transform_matrix" in "".join(faults)
-    assert "frames[2]: it has no `file_path`" in "".join(faults)
+    assert "frames[2]: has no `file_path`" in "".join(faults)
     assert len(inspection.parts.views) == 8
 
 

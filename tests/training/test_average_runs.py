@@ -141,5 +141,5 @@ def test_training_starts_on_the_hull(tmp_path, pipeline):
 def test_photographs_without_transparency_have_no_hull(tmp_path, pipeline, caplog):
     scene = ball_scene(tmp_path / "scene", 3)
     run = train(scene, tmp_path / "run", *STILL, "init.source=hull", pipeline=pipeline)
-    assert "the visual hull has only 0 points; starting from random ones" in caplog.text
+    assert "the visual hull has only 0 points; starting from random points" in caplog.text
     assert run.model.gaussians.count == 300

@@ -69,7 +69,7 @@ def test_possibly_transformed_path_gives_a_warning(views, tmp_path, caplog):
     write_camera_path(tmp_path / "p.json", views, 24)
     with caplog.at_level(logging.WARNING, "clsplat"):
         camera_path.read(tmp_path / "p.json")
-    assert "put dataparser_transforms.json next to the path" in caplog.text
+    assert "put dataparser_transforms.json next to this file" in caplog.text
 
 
 def test_path_is_resampled_to_other_frame_counts(views):

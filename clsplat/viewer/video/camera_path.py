@@ -161,7 +161,7 @@ def _world_transform(path: Path, scene: Path | None) -> Any:
     file = path.parent / WORLD
     if not file.is_file():
         LOG.warning(
-            "%s: poses are used as scene coordinates; if nerfstudio transformed the scene, put %s next to the path",
+            "%s: poses are used as scene coordinates; if nerfstudio transformed the scene, put %s next to this file",
             *(path, WORLD),
         )
         return lambda pose: pose

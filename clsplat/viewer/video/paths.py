@@ -41,7 +41,7 @@ class Rig:
     def from_views(cls, views: Sequence[View], points: Floats) -> "Rig":
         """Return a rig without outlier cameras and non-finite points.  Raises DataError if there is no view."""
         if not views:
-            raise DataError("a camera path needs the cameras of a scene, but it has none; use another scene")
+            raise DataError("a camera path needs the cameras of a scene, but this scene has none; use another one")
         is_outlier = outlier_cameras(views)
         points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         stride = -(-len(points) // MAX_POINTS) or 1
