@@ -56,6 +56,12 @@ def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
         return sorted(image.name for image in db.read_all_images())
 
 
+def min_long_side(pycolmap: ModuleType, database: Path) -> int:
+    """Return the smallest long side of the cameras in a database, px."""
+    with open_database(pycolmap, database) as db:
+        return min(max(camera.width, camera.height) for camera in db.read_all_cameras())
+
+
 def images_without_features(db: Any) -> dict[int, str]:
     """Return the names of the images without features in an open database, by image ID, sorted by name."""
     return {

@@ -7,7 +7,7 @@ import logging
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from clsplat.prepare.database import (
     MODEL,
     clear_features,
     image_names,
+    min_long_side,
     raising_data_error,
     require_pycolmap,
     verified_pairs,
@@ -34,8 +35,9 @@ from clsplat.prepare.rotation_only import no_depth_reason
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
 ENOUGH = 0.9  # fraction of the photographs; if it is placed, no attempt with denser features follows
-DENSE, WIDER = f".dense.{DATABASE}", f".wider.{DATABASE}"
-DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01, min_side=1200)
+DENSE, ENLARGED, WIDER = (f".{name}.{DATABASE}" for name in ("dense", "enlarged", "wider"))
+DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01)
+SMALL = 1200  # px, long side; smaller photographs are enlarged to twice their size if denser features are not enough
 FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap raises the middle two
 PAIR = 2  # track length of points that COLMAP drops from its models
 PAIR_ERROR = 1.0  # px, mean reprojection error; strict, since the two rays of any pair of features nearly meet
@@ -57,16 +59,20 @@ class Attempt:
     loose: bool = False  # accept fewer matches and smaller angles
     wider: bool = False  # match unplaced photographs with more others, unless all pairs were matched
     dense: bool = False  # find more features, and match the same pairs
+    enlarged: bool = False  # find the features of small photographs at twice their size, unless none is small
 
     def database(self, source: Path, out: Path) -> Path:
         """Return the path of the database with the features and matches of the attempt."""
-        return out / DENSE if self.dense else out / WIDER if self.wider else source / DATABASE
+        if self.dense:
+            return out / (ENLARGED if self.enlarged else DENSE)
+        return out / WIDER if self.wider else source / DATABASE
 
 
 RETRIES = (
     Attempt("smaller angles and fewer matches", loose=True),
     Attempt("more pairs", loose=True, wider=True),
     Attempt("denser features", loose=True, dense=True),
+    Attempt("denser features of enlarged photos", loose=True, dense=True, enlarged=True),
     Attempt("denser features, all cameras at once", "global", dense=True),
 )
 MAX_ATTEMPTS = 1 + len(RETRIES)
@@ -97,6 +103,8 @@ def map_cameras(
         placed_count = models[0].num_reg_images() if models else 0
         if tries == attempts or placed_count == len(names) or (attempt.dense and placed_count >= ENOUGH * len(names)):
             break
+        if attempt.enlarged and min_long_side(pycolmap, source / DATABASE) >= SMALL:
+            continue
         if attempt.dense and not models and graph.has_unrelated_photographs():
             break  # denser features would not help: most photographs have nothing in common
         try:
@@ -191,7 +199,7 @@ def _fill_database(source: Path, out: Path, attempt: Attempt, pairs: Sequence[tu
             clear_features(require_pycolmap(), partial)
         partial.replace(database)
     if attempt.dense:
-        add_features(source / IMAGES, database, DENSER)
+        add_features(source / IMAGES, database, replace(DENSER, min_side=SMALL if attempt.enlarged else 0))
         match_database(database, pairing)
     if attempt.dense or attempt.wider:
         match_pairs(database, pairs, pairing.threads)

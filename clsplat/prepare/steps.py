@@ -136,7 +136,7 @@ class MapCameras(Step):
     `match_features` matched all of them, and with more features.
     """
 
-    version: ClassVar[int] = 3  # enlarges small photos for denser features
+    version: ClassVar[int] = 4  # enlarges small photos if denser features are not enough
     resumes: ClassVar[bool] = True
     seconds: ClassVar[tuple[float, float]] = 0.1, 4.0  # more for further attempts
 
@@ -148,7 +148,7 @@ class MapCameras(Step):
     """Number of threads; more than one is faster, but results are not bit-identical."""
     attempts: Annotated[int, Field(ge=1, le=MAX_ATTEMPTS)] = MAX_ATTEMPTS
     """Maximum number of attempts.  The second accepts smaller angles and fewer matches; the third matches more pairs of
-    the unplaced photos, unless all pairs were matched; the last two find more features."""
+    the unplaced photos, unless all pairs were matched; the others find more features."""
     min_track_length: Literal[2, 3] = 3
     """Number of photos in which a point must be visible.  COLMAP drops points visible in only two; keeping them
     gave 2.5 times as many points on one scene."""

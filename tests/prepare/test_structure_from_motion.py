@@ -163,7 +163,7 @@ def test_further_attempts_use_the_matching_mode_or_are_off(photos, tmp_path, mon
     with pytest.raises(DataError):
         map_cameras(tmp_path / "matches", tmp_path / "cameras")
     assert set(used) == {Pairing("sequential", 2)}
-    assert len(more) == 3, "with more pairs first, and twice with denser features"
+    assert len(more) == 4, "with more pairs first, and three times with denser features"
     assert len(set(more)) == 1
 
 
