@@ -59,7 +59,7 @@ def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
 def min_long_side(pycolmap: ModuleType, database: Path) -> int:
     """Return the smallest long side of the cameras in a database, px."""
     with open_database(pycolmap, database) as db:
-        return min(max(camera.width, camera.height) for camera in db.read_all_cameras())
+        return int(min(max(camera.width, camera.height) for camera in db.read_all_cameras()))
 
 
 def images_without_features(db: Any) -> dict[int, str]:
