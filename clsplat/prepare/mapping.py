@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Literal
 
 import cv2
@@ -99,12 +100,10 @@ def map_cameras(
     if reason := no_depth_reason(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photos {reason}")
     models, best, extra_pairs, tries = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
-    for attempt in (first, *RETRIES):
+    for attempt in (first, *_retries(pycolmap, source / DATABASE)):
         placed_count = models[0].num_reg_images() if models else 0
         if tries == attempts or placed_count == len(names) or (attempt.dense and placed_count >= ENOUGH * len(names)):
             break
-        if attempt.enlarged and min_long_side(pycolmap, source / DATABASE) >= SMALL:
-            continue
         if attempt.dense and not models and graph.has_unrelated_photographs():
             break  # denser features would not help: most photographs have nothing in common
         try:
@@ -140,6 +139,12 @@ def map_cameras(
     _remove_hidden(out)
     log_warnings(result)
     return result
+
+
+def _retries(pycolmap: ModuleType, database: Path) -> list[Attempt]:
+    """Return the attempts after the first one that make a difference for photographs of these sizes."""
+    has_small = min_long_side(pycolmap, database) < SMALL
+    return [attempt for attempt in RETRIES if has_small or not attempt.enlarged]
 
 
 def _remove_hidden(folder: Path) -> None:
