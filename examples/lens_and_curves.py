@@ -24,9 +24,9 @@ class CameraResponse(TrainingModule):
     A pixel x of the render becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
     (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and
     center_y are its offset from the principal point.  f is a monotone spline for each channel (Ramsay 1988), f(0) = 0
-    and f(1) = 1.  Its slope is piecewise linear; red_0, 1, 3, and 4 are the logarithms of the slope at 0, 1/4, 3/4, and
-    1, relative to that at 1/2.  PPISP (Deutsch et al. 2026) has a similar falloff, and power curves.  All
-    parameters start at 0, the identity.
+    and f(1) = 1.  Its slope is piecewise linear; red_0, red_1, red_3, and red_4 are the logarithms of the slope at 0,
+    1/4, 3/4, and 1, relative to the slope at 1/2.  PPISP (Deutsch et al. 2026) has a similar falloff, but power curves.
+    All parameters start at 0, which is the identity.
 
     Views with the same lens or the same pinhole camera in the dataset share a set.  Test views are evaluated with the
     set of their camera, or with the identity if it has no training photos.  The model and its renders do not change.
@@ -42,8 +42,8 @@ class CameraResponse(TrainingModule):
     rate: NonNegative = 1e-3
     """Learning rate (Adam) of the parameters; may be scheduled. Runs of a few hundred steps need 5e-3."""
     weight: NonNegative = 1e-2
-    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. It leaves the response
-    that all photos share to the Gaussians."""
+    """Weight of the sum of the squared parameters of the step's camera; may be scheduled. With this loss,
+    the Gaussians, not the curves, learn a response that all photos share."""
 
     def create_state(self, run: Run) -> ModuleState:
         return CameraResponseState(self, [view.name for view in run.scene.split("train")], run.original.cameras)

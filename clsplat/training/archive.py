@@ -4,7 +4,7 @@
     meta.npy          JSON metadata, with the hashes of arrays by name under the key `sha256`
     meta_sha256.npy   the SHA-256 of meta.npy
 
-NumPy can read the arrays.  Any changed byte is detected, except in fields that are not used, such as time stamps.
+NumPy can read the arrays.  Any changed byte is detected, except in ZIP fields that are not used, such as timestamps.
 """
 
 import errno
@@ -39,8 +39,8 @@ def write(file: BinaryIO, metadata: Metadata, arrays: Iterable[tuple[str, NDArra
 def read(path: Path) -> tuple[Metadata, Arrays]:
     """Read metadata and arrays.
 
-    Raises DataError if the file is damaged; its message is only the reason.  Raises OutputError or MemoryError if the
-    system cannot read the file, which does not mean that it is damaged.
+    Raises DataError if the file is damaged; the message gives only the reason, not the path.  Raises OutputError or
+    MemoryError if the system cannot read the file; the file itself may then be intact.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
@@ -68,7 +68,7 @@ def read(path: Path) -> tuple[Metadata, Arrays]:
 
 
 def split(arrays: Mapping[str, NDArray[np.float32]], folder: str) -> tuple[Arrays, Arrays]:
-    """Return the arrays with the prefix `folder`, which is removed from their names, and the remaining arrays."""
+    """Return the arrays whose names start with `folder`, without that prefix, and the remaining arrays."""
     members = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
     return members, {name: array for name, array in arrays.items() if not name.startswith(folder)}
 
@@ -113,7 +113,7 @@ def _read(archive: zipfile.ZipFile, name: str, digest: str) -> bytes:
 
 
 def _parse_array(data: bytes) -> NDArray[Any]:
-    """Parse a member without a copy, since a damaged header may declare any shape."""
+    """Return the array in the bytes of an .npy file, as a view, because a damaged header may declare a huge shape."""
     stream = io.BytesIO(data)
     np.lib.format.read_magic(stream)
     shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream, max_header_size=1000)

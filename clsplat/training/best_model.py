@@ -31,7 +31,7 @@ class Scores(BaseModel):
         return self.train - self.validation > OVERFIT_GAP
 
     def text(self, views: str) -> str:
-        """Return a sentence with the scores.  views: name of the views that were not used in training."""
+        """Return a sentence with the scores.  views: `test` or `validation`."""
         psnrs = f"{self.train:.1f} dB at training views and {self.validation:.1f} dB at {views} views"
         return f"At step {self.step:,} the model has {psnrs}{self.overfit_text()}."
 
@@ -49,13 +49,13 @@ class Best(BaseModel):
     measured: Scores
     """Scores of the best model so far."""
     degree: Annotated[int, Field(ge=0, le=3)]
-    """Active degree of its spherical harmonics."""
+    """Active degree of the spherical harmonics of the best model."""
     metrics: dict[str, dict[str, dict[str, Any]]]
     """Average metrics of the best model, by split and downscale."""
     scalars: dict[str, float] = {}
     """Scalars of the run at the step of the best model."""
     modules: dict[str, dict[str, float]] = {}
-    """Scalars of the modules at that step, by type."""
+    """Scalars of the modules at the step of the best model, by module type."""
     evaluations: Count
     """Number of evaluations so far."""
     since_best: Count
@@ -65,14 +65,14 @@ class Best(BaseModel):
     last: Scores
     """Scores of the last model."""
     growth_ended: Count | None = None
-    """Global step at which growth stopped, because validation no longer improved; None while it continues."""
+    """Global step at which growth stopped because validation no longer improved; None while growth continues."""
     ended: Count | None = None
-    """Global step at which training ended with this model; None while it continues."""
+    """Global step at which training ended and kept this model; None while training continues."""
     refit: Literal["none", "due", "begun"] = "none"
-    """State of the refit, which repeats training on all training photos for the same number of steps."""
+    """State of the refit, which repeats training, including the validation photos, for the steps of the best model."""
 
     def with_last(self, last: Scores) -> "Best":
-        """Return the record after an evaluation in which the model did not improve."""
+        """Return a copy of this record, updated with an evaluation in which the model did not improve."""
         changes = {"last": last, "evaluations": self.evaluations + 1, "since_best": self.since_best + 1}
         first_overfit = self.first_overfit or (last if last.is_overfit else None)
         return self.model_copy(update=changes | {"first_overfit": first_overfit})

@@ -1,7 +1,7 @@
 """Save and restore a run, bit for bit: parameters, Adam moments, statistics, and counters, without pickle.
 
-Random numbers and the order of views depend only on (seed, step), so the step is their state.  A state with NaN or
-infinity is saved as failed_N.npz, which is never resumed.
+Random numbers and the order of views depend only on (seed, step), so no generator state is saved.  A run state with NaN
+or infinity is saved as failed_N.npz, which is never resumed.
 """
 
 import logging
@@ -88,7 +88,7 @@ class State(BaseModel):
     pipeline: dict[str, Any]
 
     def is_trained(self, pipeline: dict[str, Any]) -> bool:
-        """Return whether the current stage has completed all its steps in a resolved pipeline."""
+        """Return whether the current stage has completed all the steps that a resolved pipeline gives it."""
         (stage,) = pipeline["stages"][self.stage_index].values()
         return bool(stage.get("steps") == self.stage_step)
 
@@ -126,14 +126,14 @@ MODULES = "modules/"  # prefix of module names, which are prefixes of table name
 
 
 def module_tables(run: Run, full: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the keys in the file and the tables of a run's modules.  full: include tables that only training needs."""
+    """Yield the tables of a run's modules with their keys in the file.  full: also those that only training needs."""
     for module, state in run.modules.items():
         if full or state.after_training != "dropped":
             yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(full).items())
 
 
 def check_modules(scalars: Mapping[str, Scalars], tables: Arrays) -> None:
-    """Raise DataError if tables do not fit the modules.  scalars: by module; tables: by key without prefix MODULES."""
+    """Raise DataError if tables do not fit the modules.  scalars: by module; tables: by key, without MODULES."""
     for name in scalars:
         saved_tables, tables = split(tables, f"{name}/")
         module_class(name).check_saved(scalars[name], saved_tables)
@@ -169,7 +169,7 @@ UPDATES = "field"  # key of a field's number of updates
 
 
 def run_tables(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the keys in the file and the tables of a run; the tables are copied to the host one at a time."""
+    """Yield the tables of a run with their keys in the file; the tables are copied to the host one at a time."""
     if run.learned_field:
         yield from ((field.FOLDER + name, table) for name, table in run.learned_field.tables().items())
         return
@@ -180,7 +180,7 @@ def run_tables(run: Run) -> Iterator[tuple[str, NDArray[np.float32]]]:
 
 
 def update_counts(run: Run) -> dict[str, int]:
-    """Return the number of Adam updates of each parameter, or of a field."""
+    """Return the number of Adam updates of each parameter, or of the whole field if the run trains a field."""
     if run.learned_field:
         return {UPDATES: run.learned_field.updates}
     return run.adam.updates if run.adam else {}
@@ -246,9 +246,10 @@ VELOCITY = "motion.velocity"  # its rate is lowered if a motion is not finite
 
 
 def suggest_rate(run: Run, broken: Collection[str]) -> str:
-    """Return `key=value` for `--set`, which lowers the rate of the broken parameter furthest above its default.
+    """Return a `key=value` for `--set` that lowers the learning rate of one of the `broken` parameters.
 
-    The value is a tenth of the current rate, or the default if that is smaller.  A field has only one rate.
+    This is the parameter whose rate has the largest ratio to its default.  The value is a tenth of the current rate, or
+    the default if that is smaller.  A field has only one rate.
     """
     if run.learned_field:
         (stage,) = run.pipeline["stages"][run.stage_index]
@@ -278,8 +279,8 @@ def save(run: Run, keep: int | None = None) -> Path:
     """Write checkpoints/step_N.npz atomically, and return its path.
 
     keep: number of newest checkpoints to keep; older ones are removed.  Raises NotFiniteError, after writing
-    failed_N.npz, if the model is not finite; then nothing is removed.  Raises ClsplatError in the middle of a step or
-    an edit.
+    failed_N.npz, if the model is not finite; then nothing is removed.  Raises ClsplatError if called in the middle of
+    a step or an edit.
     """
     if not run.is_consistent:
         raise ClsplatError(f"{run.out}: step {run.step} is incomplete, so it is not saved; resume the run")
@@ -296,7 +297,7 @@ def save(run: Run, keep: int | None = None) -> Path:
 
 
 def save_failed(run: Run, broken: list[str]) -> str:
-    """Save a state that is not finite as failed_N.npz, replacing older files; return the end of the error message."""
+    """Save a state that is not finite as failed_N.npz, and remove older ones; return the end of the error message."""
     try:
         path = _write(run, "failed")
         _remove(file for file in path.parent.glob("failed_*.npz") if file != path)
@@ -322,7 +323,10 @@ def list_files(out: Path) -> list[Path]:
 
 
 def load(path: Path) -> tuple[State, Arrays]:
-    """Read a checkpoint.  Raises DataError, with only the reason, if it is damaged; ConfigError for another format."""
+    """Read a checkpoint.  Raises ConfigError if it has another format, and DataError if it is damaged.
+
+    The message of DataError gives only the reason, not the path.
+    """
     metadata, tables = archive.read(path)
     if type(metadata.get("format")) is int and metadata["format"] != FORMAT:
         raise ConfigError(
@@ -357,8 +361,9 @@ def _check_metrics(metrics: Metrics) -> None:
 def restore(run: Run) -> tuple[Path | None, list[str]]:
     """Restore the newest valid checkpoint; return its path (None if there is no checkpoint) and remarks to log.
 
-    The remarks report changes of settings and of the device.  Raises ConfigError for a change of a setting that cannot
-    change on resume, or for another format; OutputError if all checkpoints are damaged or missing.
+    The remarks report changes of settings and of the device.  Raises ConfigError if a setting has changed that must not
+    change on resume, or if a checkpoint has another format; OutputError if all checkpoints are damaged, or if there are
+    none although status.json names one.
     """
     paths = list_files(run.out)
     restart = f"start over with `clsplat run {shell_quote(run.out / PIPELINE)} --out {shell_quote(run.out)} --restart`"
@@ -394,7 +399,7 @@ def rename_damaged(out: Path, restored_path: Path | None) -> None:
 
 
 def _remove(files: Iterable[Path]) -> None:
-    """Remove older states.  On Windows, a file that another program is reading remains until the next call."""
+    """Remove files of older states.  On Windows, a file that another program is reading remains until the next call."""
     for file in files:
         try:
             file.unlink(missing_ok=True)
@@ -448,7 +453,7 @@ def _field_entry(run: Run) -> dict[str, Any] | None:
 
 
 def _record_changes(run: Run, path: Path, state: State) -> list[str]:
-    """Record and return the changed settings.  Raises ConfigError for one that cannot change on resume."""
+    """Record and return the changed settings.  Raises ConfigError if one of them must not change on resume."""
     changes, remedy = [], "restore the setting, or start over with `clsplat run --restart` or another --out"
     previous = state.pipeline
     if run.inputs and state.inputs == run.inputs:  # the same scene, possibly moved

@@ -1,6 +1,7 @@
 """Plan the device memory of training before it is allocated.
 
-The plan counts bytes per Gaussian for tables, and per Gaussian, pair, and pixel for a frame.
+The plan counts bytes per Gaussian for the tables, and bytes per Gaussian, per (tile, Gaussian) pair, and per pixel
+for a frame.
 """
 
 import math
@@ -97,18 +98,18 @@ def offload_target(harmonics: Harmonics, limits: DeviceLimits) -> Location:
 
 
 def max_pixels(views: Sequence[View], tile: int) -> int:
-    """Return the number of pixels of the largest view, rounded up to full tiles.  tile: side, px."""
+    """Return the number of pixels of the largest view, rounded up to full tiles.  tile: side of a tile, px."""
     return max(-(-view.camera.width // tile) * -(-view.camera.height // tile) * tile**2 for view in views)
 
 
 def module_bytes(stages: Iterable[Any], views: Sequence[View], tile: int) -> int:
-    """Return the device bytes of modules in the stage where they need the most."""
+    """Return the device memory of modules, in bytes, in the stage whose modules need the most."""
     lists = [getattr(stage, "modules", ()) for stage in stages]
     return max((sum(module.device_bytes(views, tile) for module in modules) for modules in lists), default=0)
 
 
 def table_widths(degree: int, motion: int = 0) -> dict[str, int]:
-    """Return the number of components of each parameter and moment.  motion: number of columns of the motion."""
+    """Return the number of components of each parameter and moment.  motion: columns of the motion table."""
     widths = (3, 4, 3, 1, 3, 3 * (sh_coefficients(degree) - 1))
     parameters = dict(zip(PARAMETERS, widths, strict=True)) | ({MOTION: motion} if motion else {})
     return parameters | {table: width for name, width in parameters.items() for table in moment_tables(name)}

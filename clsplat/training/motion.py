@@ -51,7 +51,7 @@ class MotionRates(Settings):
         return [name for name in type(self).model_fields if name != "min_duration"]
 
     def at(self, step: int, extent: float) -> dict[str, float]:
-        """Return the rates at a global step, keyed by field, and `min_duration`.  extent: of the scene, scene units."""
+        """Return the rates at a global step, by field, and `min_duration`.  extent: extent of the scene."""
         rates = {name: at_step(getattr(self, name), step) for name in self._rates}
         return {**rates, **{name: rates[name] * extent for name in IN_EXTENTS}, "min_duration": self.min_duration}
 
@@ -64,9 +64,9 @@ def update_motion(
     updates: int,
     every: int,
 ) -> None:
-    """Update the motion from gradients in memory.
+    """Update the motion of all or only the visible Gaussians with Adam.
 
-    depth_key: depth keys of the view, [S]; rates: from MotionRates.at; updates: number of updates, including this one;
+    depth_key: depth keys of the view, [S]; rates: from `MotionRates.at`; updates: number of updates with this one;
     every: all bits set to update all rows, 0 to update only visible rows.
     """
     table, (moment1, moment2) = gaussians.tables[MOTION], moment_tables(MOTION)

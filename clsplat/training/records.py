@@ -57,7 +57,7 @@ class Records:
     def start(self, is_refit: bool = False) -> None:
         """Drop the lines that were written after the restored state; the resumed run writes them again.
 
-        If the state is from before a refit, the lines in trial.jsonl are moved back.  A line that cannot be read is
+        If the state is from before a refit, the lines of trial.jsonl are moved back.  A line that cannot be read is
         dropped with all lines after it, and a warning is logged.
         """
         if not is_refit and self.trial.exists():
@@ -191,12 +191,12 @@ MIN_COST = 0.4  # likewise; fits are unreliable on a busy machine
 
 
 def moving_average(psnrs: Sequence[float]) -> list[float]:
-    """Return the moving average of PSNR over PSNR_REPORTS reports, each of one view, because views differ a lot."""
+    """Return the moving average of PSNRs over PSNR_REPORTS views, since single views differ a lot."""
     return [fmean(psnrs[max(0, end - PSNR_REPORTS) : end]) for end in range(1, len(psnrs) + 1)]
 
 
 class Forecast:
-    """Estimates the remaining training time.  Training ends at step `last_step`, growth at `growth_end`."""
+    """An estimate of the remaining training time.  Training ends at step `last_step`; growth ends at `growth_end`."""
 
     def __init__(self, last_step: int, growth_end: int) -> None:
         self.last_step, self.growth_end = last_step, growth_end

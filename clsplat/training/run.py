@@ -103,7 +103,7 @@ class Run:
         self._model, self.learned_field = model, None
 
     def painter(self, rasterizer: Rasterizer | None = None) -> Painter:
-        """Return the renderer of views.  rasterizer: default: that of training.  Raises ConfigError like `model`."""
+        """Return the renderer of views.  rasterizer: by default, that of training.  Raises ConfigError like `model`."""
         if self.learned_field:
             return self.learned_field.painter
         return SplatPainter(rasterizer or self.rasterizer, self.model, self.photographs.background)
@@ -127,13 +127,13 @@ class Run:
 
     @property
     def model_step(self) -> int:
-        """The global step of the model's last update; less than `step` if an earlier, best model was restored."""
+        """The global step of the model's last update; less than `step` if the run returned to its best model."""
         is_best = self.best is not None and self.best.ended == self.step and self.best.refit != "begun"
         return self.best.measured.step if self.best and is_best else self.step
 
     @property
     def is_refit(self) -> bool:
-        """Whether the run trains again, including the validation views, for the best number of steps."""
+        """Whether the run is training again with the validation views too, up to the step of the best model."""
         return self.best is not None and self.best.refit == "begun"
 
     def restart_for_refit(self, best: Best) -> None:
@@ -205,7 +205,7 @@ class Run:
         harmonics: Location | None = None,
         visible: float = VISIBLE_FRACTION,
     ) -> MemoryPlan:
-        """Plan the device memory for training with the current tables, or those in `components`.
+        """Plan the device memory for training with the current tables, or with tables of these `components`.
 
         harmonics: where the bands above 0 are stored; None for their current location.  visible: as in `plan`.
         """
@@ -263,7 +263,7 @@ def host_model(run: Run) -> Model:
 
 
 def sky_center(run: Run) -> NDArray[np.float64]:
-    """Return the median camera position, [3]: the center of the sky Gaussians, from which the sky looks exact."""
+    """Return the median camera position, [3], for a sky that is exported as Gaussians, which looks exact from there."""
     return np.median([view.position for view in run.scene.views], axis=0)
 
 

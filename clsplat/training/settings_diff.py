@@ -22,13 +22,13 @@ class Difference(NamedTuple):
         return f"{self.key_path} was {shorten(repr(self.old), 80)}, is {shorten(repr(self.new), 80)}"
 
     def is_moved_file(self, old_hashes: Mapping[str, str], new_hashes: Mapping[str, str]) -> bool:
-        """Return whether a file was only moved.  old_hashes, new_hashes: hashes of input files by path."""
+        """Return whether only the path of a file changed.  old_hashes, new_hashes: hashes of input files by path."""
         is_text = isinstance(self.old, str) and isinstance(self.new, str)
         return is_text and self.old in old_hashes and old_hashes[self.old] == new_hashes.get(self.new)
 
     @property
     def stage(self) -> int | None:
-        """The index of the setting's stage in the pipeline; None outside of stages."""
+        """The index of the setting's stage in the pipeline; None if the setting is not in a stage."""
         match = re.match(r"stages\[(\d+)\]", self.key_path)
         return int(match[1]) if match else None
 
@@ -74,7 +74,7 @@ def first_difference(old: Any, new: Any) -> Difference | None:
 
 
 def _child(settings: Any, key: str) -> tuple[Any, Kind]:
-    """Return the settings under a key, and the kind of a difference of that key."""
+    """Return the settings under a key, and the kind of a difference under that key."""
     if not isinstance(settings, Settings):
         return None, None
     if key in type(settings).model_fields:

@@ -28,7 +28,7 @@ class PathInRun(AfterValidator):
 
 
 def path_in_run(*suffixes: str) -> PathInRun:
-    """Return the marker for a field with the path of a file that has one of `suffixes`, or of a folder."""
+    """Return the marker for the path of a file with one of `suffixes`, or of a folder if there are no suffixes."""
 
     def check(text: str) -> str:
         fault = invalid_output_reason(text)
@@ -42,7 +42,7 @@ def path_in_run(*suffixes: str) -> PathInRun:
 
 
 def _marks(annotation: Any, metadata: Iterable[Any]) -> list[PathInRun]:
-    """Return the markers in metadata and in the metadata of a type's arguments."""
+    """Return the markers in `metadata` and, recursively, in the metadata of the type arguments of an annotation."""
     marks = [mark for mark in metadata if isinstance(mark, PathInRun)]
     return marks + [
         mark for argument in get_args(annotation) for mark in _marks(argument, getattr(argument, "__metadata__", ()))
@@ -108,7 +108,7 @@ class Scheduled(Stage):
     runs_at_end: ClassVar[bool] = False  # whether it also runs after the last step of training
 
     every: EverySteps | None = None
-    """Number of steps from one run of the stage to the next, may be fractional; only in `during`."""
+    """Number of steps from one run of the stage to the next, which may be fractional; only in `during`."""
     start: Annotated[int, Field(ge=0)] = 0
     """Global step after which the stage runs."""
     stop: Annotated[int, Field(gt=0)] | None = None
@@ -136,7 +136,7 @@ class Scheduled(Stage):
 
 
 def find_output_conflict(stages: Sequence[Stage]) -> str | None:
-    """Return a path that two stages would write, at least one of them as a file, or None.
+    """Return a path that two stages would both write, unless both write it as a folder; None if there is none.
 
     Stages may share a folder.  Names are compared ignoring case, as some file systems do.
     """

@@ -52,7 +52,7 @@ class Status(BaseModel):
     state: Literal["starting", "preparing", "running", "done", "failed", "interrupted"]
     """starting: opens the device; preparing: prepares and reads the scene; running: runs stages; others are final."""
     stage: str | None = None
-    """Current or last stage, or step of `prepare`; of a matrix, the cell."""
+    """Current or last stage, or step of `prepare`; for a matrix, the current or last cell."""
     progress: StageProgress | None = None
     """Progress of that stage, if it can be counted."""
     step: Count | None = None
@@ -76,7 +76,7 @@ class Status(BaseModel):
     exit_code: int | None = None
     """Exit code of a run that ended."""
     message: str | None = None
-    """Reason why a run failed or was interrupted."""
+    """Reason why the run failed or was interrupted."""
     device: str | None = None
     """OpenCL device and runtime."""
     version: str
@@ -86,13 +86,13 @@ class Status(BaseModel):
     process: Count
     """Process ID on that machine."""
     pid_namespace: str | None = None
-    """Linux: the namespace of that ID; each container has its own."""
+    """Linux: the namespace of the process ID; each container has a separate namespace."""
     boot: str | None = None
     """Linux: ID of the boot in which that process ID is valid."""
     started: Seconds
     """When this process started the run."""
     changed: Seconds
-    """When state, stage, progress or step last changed."""
+    """When `state`, `stage`, `progress`, or `step` last changed."""
     time: Seconds
     """Heartbeat: when this file was written; at least every 10 s while the process lives."""
 

@@ -31,7 +31,7 @@ TEXTURE = int(constants("splat.h")["SUM_TEXTURE"])
 class StepTrainer:
     """The objects of a training step; pipelines, benchmarks, and notebooks call the same `step`.
 
-    A custom loop over the training views of a scene, from a model of `clsplat.load`:
+    A custom loop over the training views of a scene that trains a model loaded with `clsplat.load`:
 
         model = model.upload(device)
         photographs = Photographs(device, scene.background)

@@ -1,4 +1,4 @@
-"""Modules of a training step in addition to the Gaussians, each with its settings and its state in one file."""
+"""Training modules, which extend a training step; each file contains the settings and the state of one module."""
 
 from clsplat.core.settings import import_modules
 

@@ -87,7 +87,7 @@ class ModuleState:
     """
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "dropped"
-    """Whether the state is dropped after its training, kept for evaluation, or active in later training runs too."""
+    """Whether the state is dropped after its training stage, kept for evaluation, or active in later training too."""
     is_saved: ClassVar[bool] = True  # whether checkpoints contain the state
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class ModuleState:
         """Set the initial values in a run without an earlier state of this module."""
 
     def prepare(self, run: Run, last_step: int, is_trained: bool = True) -> None:
-        """Prepare for training that ends at global step `last_step`.  is_trained: whether the module learns in it."""
+        """Prepare for training that ends at global step `last_step`.  is_trained: whether the module learns."""
 
     # in a step: forward in list order, backward and update in reverse
     def before_render(self, step: TrainingStep) -> None: ...
@@ -125,7 +125,7 @@ class ModuleState:
         """Attach objects to a model, such as a sky, that are rendered together with its Gaussians."""
 
     def finish(self, run: Run) -> None:
-        """Run after the last step, before the best model replaces the last one."""
+        """Called after the last training step, before the best model replaces the model of that step."""
 
     @property
     def color_model(self) -> ColorFit | None:
@@ -133,7 +133,7 @@ class ModuleState:
         return None
 
     def apply_to(self, scene: Scene) -> Scene:
-        """Return a full-size scene with the learned cameras."""
+        """Return `scene`, which must be at full size, with the learned cameras."""
         return scene
 
     def write(self, run: Run) -> None:
@@ -145,7 +145,7 @@ class TrainingModule(Settings):
 
     order: ClassVar[int] = 0
     """Modules must be listed in ascending order of this number.  Modules below 20 change the camera, model, background,
-    or photo; below 30, layers in front of the scene; below 40, colors; and below 99, the images that are compared.
+    or photo; those below 30, layers in front of the scene; below 40, colors; below 99, the images that are compared.
     The order is a number, not a list of modules, so that plug-ins can be ordered too."""
     side_files: ClassVar[Mapping[str, str]] = {}
     """Titles of the files that the module writes to the run folder, by file name; the names start with `view_`."""
@@ -165,7 +165,7 @@ class TrainingModule(Settings):
 
     @classmethod
     def implied_module(cls, run: Run, stage: Any) -> "TrainingModule | None":
-        """Return the module if the run's model or the stage's losses imply it, or None."""
+        """Return the module if the run's model or the stage's losses imply it; otherwise None."""
         return None
 
     def resolve_auto(self, run: Run) -> "TrainingModule":
@@ -249,7 +249,7 @@ def attach_modules(modules: Sequence[TrainingModule], run: Run, last_step: int) 
 
 
 def modules_so_far(run: Run) -> dict[str, TrainingModule]:
-    """Return the modules of a run's stages up to the current one: the last module of each type, by type."""
+    """Return the modules of a run's stages up to the current stage, by type; of several with one type, the last."""
     stages = getattr(run.settings, "stages", ())[: run.stage_index + 1]
     modules = (module for stage in stages for module in getattr(stage, "modules", ()))
     return {module.type: module for module in (*modules, *implied_modules(run)) if module.is_active(run.scene)}

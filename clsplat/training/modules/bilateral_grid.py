@@ -52,11 +52,11 @@ class BilateralGrid(Appearance):
 
     type: Literal["bilateral_grid"] = "bilateral_grid"
     grid_shape: Annotated[list[Nodes], Field(min_length=3, max_length=3)] = Field([4, 4, 4])
-    """Number of matrices along width, height, and luminance, 1 to 16 each, interpolated trilinearly; the outer ones are
-    on the edges, at black and white.  The paper uses [16, 16, 8]."""
+    """Numbers of matrices along width, height, and luminance, 1 to 16 each.  They are interpolated trilinearly; the
+    outer matrices are at the edges of the photo, and at black and white.  The paper uses [16, 16, 8]."""
     rate: RateOrAuto = "auto"
-    """Learning rate; may be scheduled.  auto: 2e-3 to 2e-5 (gsplat), or that of `exposure` if exposures are unknown,
-    with a warm-up from 1% over 1000 steps, or a tenth of all steps if that is less.  At most 0.5."""
+    """Learning rate, at most 0.5; may be scheduled.  auto: 2e-3 to 2e-5 (gsplat), or the automatic rate of `exposure`
+    if exposures are unknown.  Both rise from 1% in the first 1000 steps, or in a tenth of all steps if fewer."""
     weight: Annotated[float, Field(ge=0)] = 10.0
     """Weight of the total variation loss of the step's grid: the mean squared difference of adjacent nodes, summed over
     the axes."""
@@ -198,7 +198,7 @@ class GridState(ColorState):
     def differentiate(
         self, workspace: Workspace, camera: DeviceCamera, image: Array, gradient: Array, view: int
     ) -> tuple[Array, Array]:
-        """Return the gradients of the input of `transform` and of the grid, [row].  gradient: of the result."""
+        """Return the gradients of `image` and of the grid, [row].  gradient: gradient of the result of `transform`."""
         (nx, _, nz), row = self.settings.grid_shape, row_length(self.settings.grid_shape)
         result = workspace.array("grad_colored", image.shape)
         unclamped = workspace.array("grid passed", (3, *image.shape[1:]))
@@ -236,7 +236,7 @@ class GridState(ColorState):
         }
 
     def learn(self, workspace: Workspace, view: int, grad_grid: Array, step: int) -> None:
-        """Update the grid of a view with Adam, which counts the updates of each grid.  Then center all grids.
+        """Update the grid of a view with Adam, with a separate update count for each grid.  Then center all grids.
 
         grad_grid: gradient of the image losses, [row].  The gradient of the total variation is in the workspace.
         """
@@ -272,7 +272,7 @@ def row_length(shape: Sequence[int]) -> int:
 
 
 def grid_bytes(shape: Sequence[int], photographs: int, rows: int) -> int:
-    """Return the size of grids on the device, in bytes.
+    """Return the device memory of the grids of all photographs, in bytes.
 
     shape: nx, ny, nz; rows: number of pixel rows of the largest view, padded to full tiles.
     """

@@ -46,7 +46,8 @@ class CameraOptimizer(TrainingModule):
     """Optimize the camera pose of each photograph together with the model.
 
     Each photograph has a rotation vector and a translation in world axes, trained by Adam from 0.  The camera rotates
-    about the point on its optical axis at the median depth of the dataset's points, or at the extent without points.
+    about the point on its optical axis at the median depth of the dataset's points, or at the scene's extent if
+    there are too few points.
     A step updates its photograph and then subtracts the means over all photographs, because losses cannot detect a
     motion that all cameras share with the Gaussians.  The world filter, the extent, and rules that compare the model
     with photographs use the dataset's cameras.
@@ -73,10 +74,10 @@ class CameraOptimizer(TrainingModule):
     """Learning rate of rotations, rad; may be scheduled.  auto: 0.3 times the automatic rate of translations."""
     translation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
     """Learning rate of translations, relative to the median depth; may be scheduled.  auto: 2e-4 to 2e-6; with few
-    visits per photo, large enough for a translation of 0.01, up to 2e-3."""
+    visits per photo, larger, so that a photo's rates add up to 0.01, but at most 2e-3."""
     focal: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = 0.0
     """Learning rate of the logarithms of focal lengths; may be scheduled; 0: fixed.  auto: 1e-4 to 1e-6; with few
-    visits per camera, large enough that the rates of its visits add up to 0.2, up to 1e-3."""
+    visits per camera, larger, so that a camera's rates add up to 0.2, but at most 1e-3."""
     start: Annotated[int, Field(ge=0)] = 500
     """Global step after which poses are optimized; before it, the model is too blurry to align cameras."""
 
@@ -95,9 +96,9 @@ class CameraOptimizer(TrainingModule):
         return automatic if self.focal == "auto" else self.focal
 
     def _decay(self, last: int, rows: int, reach: float, bounds: tuple[float, float]) -> Decay:
-        """Return a decaying rate that adds up to `reach` over the visits of one of `rows` photographs or cameras.
+        """Return a decaying rate whose values at the visits of one photograph, or one camera, add up to `reach`.
 
-        bounds: limits of the initial rate.
+        rows: number of photographs or cameras; bounds: limits of the initial rate, which take precedence over `reach`.
         """
         steps = max(last - self.start, 1)
         visits = steps / rows
@@ -157,7 +158,7 @@ class PoseChange:
 
 
 def _rotation_vector_gradient(vector: Floats, grad_rotation: Floats) -> Floats:
-    """Return the gradient of a rotation vector from that of a subsequent small rotation (right Jacobian of SO(3))."""
+    """Return the gradient of a rotation vector from that of a small rotation after it (right Jacobian of SO(3))."""
     angle, x, y, z = math.hypot(*vector), *vector
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     if angle > 1e-4:
@@ -252,7 +253,7 @@ class CameraState(ModuleState):
         return f"{FOCALS}/{self.cameras.get(view, view)}/log"
 
     def apply_to(self, scene: Scene) -> Scene:
-        """Return a scene with the learned cameras.
+        """Return `scene`, which must be at full size, with the learned cameras.
 
         Other views get the focal lengths of their camera, and follow the common motion of the training views: their
         centers are scaled about the mean center.  Their rotations do not change, since learned rotations have a zero
@@ -334,7 +335,7 @@ def _format_range(low: float, high: float) -> str:
 
 
 def _with_pose(path: Path, view: View, row: Any, origin: NDArray[np.floating]) -> View:
-    """Return a view with the camera in its row of a side file, in world coordinates; unchanged if it has no row."""
+    """Return a view with the camera in `row` of a side file, shifted to `origin`; unchanged if there is no row."""
     if row is None:
         return view
     try:

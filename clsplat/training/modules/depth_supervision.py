@@ -25,7 +25,7 @@ class DepthSupervision(TrainingModule):
         return cls(type=cls.implicit_type, losses=losses) if losses else None
 
     def check_run(self, run: Run) -> None:
-        """Raise DataError if the scene has no tracks or a depth map is missing, and ConfigError for two folders."""
+        """Raise DataError if tracks or a depth map are missing; ConfigError if the losses name different folders."""
         if len({loss.folder for loss in self.losses}) > 1:
             raise ConfigError("the loss 'inverse_depth' is listed with two folders; keep only one of them")
         if run.scene.tracks is None:
@@ -38,7 +38,7 @@ class DepthSupervision(TrainingModule):
 
     @property
     def _maps(self) -> DepthMaps | None:
-        """The depth maps; None to use only points."""
+        """The depth maps; None if the losses use only points."""
         folder = self.losses[0].folder
         return DepthMaps(Path(folder)) if folder else None
 

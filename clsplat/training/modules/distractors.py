@@ -53,9 +53,9 @@ class Distractors(TrainingModule):
     count: Annotated[int, Field(gt=0, le=10_000)] = 200
     """Number of Gaussians per photo."""
     start: Annotated[int, Field(ge=0)] = 0
-    """Global step after which they are rendered."""
+    """Global step after which these Gaussians are rendered."""
     cover: NonNegative = 0.1
-    """Weight of the loss on their mean alpha over the photo; may be scheduled."""
+    """Weight of the loss on the mean alpha of these Gaussians over the photo; may be scheduled."""
 
     def create_state(self, run: Run) -> "DistractorsState":
         sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget
@@ -80,7 +80,7 @@ class DistractorsState(ModuleState):
     """The Gaussians of each photograph on the device, with a separate Adam for each photograph."""
 
     def __init__(self, settings: Distractors, views: Sequence[View], rasterizer: Rasterizer) -> None:
-        """views: the training views; rasterizer: only for these Gaussians, since frames share its buffers."""
+        """views: the training views; rasterizer: used only here, since its frames share buffers."""
         super().__init__()
         self.settings, self.rasterizer, self.adams = settings, rasterizer, list[Adam]()
         self._names = list(dict.fromkeys(view.name for view in views))
@@ -133,7 +133,7 @@ class DistractorsState(ModuleState):
 
 
 def initial_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:
-    """Return the initial Gaussians of photographs, which are evenly spread and almost transparent.
+    """Return the initial Gaussians for photographs: evenly spread over each one, and almost transparent.
 
     They have the colors of the photographs.  photographs: pairs of a view and its pixels, [height, width, 3].
     """

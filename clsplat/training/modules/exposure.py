@@ -75,15 +75,15 @@ class Appearance(TrainingModule):
     device_planes: ClassVar[int] = 6  # the transformed image, and its gradient
 
     rate: RateOrAuto = "auto"
-    """Learning rate; may be scheduled.  auto: 2e-3 to 2e-5, or 1e-2 to 1e-3 with fewer than 400 visits per photo;
-    if exposures are unknown, large enough for a gain of 2.7, up to 5e-2.  At most 0.5."""
+    """Learning rate, at most 0.5; may be scheduled.  auto: 2e-3 to 2e-5, or 1e-2 to 1e-3 with fewer than 400 visits
+    per photo; if exposures are unknown, large enough to reach a gain of 2.7, but at most 5e-2."""
 
     when: Literal["always", "auto"] = "always"
     """`auto`: only if exposures differ.
 
     Before training, log exposures are measured on the tracks of the dataset's points.  The module is active if both
-    their standard deviation and the fraction of variance that they explain are large enough; view-dependent light
-    explains the remainder.  If it is not active, the model is bit-identical to one without the module."""
+    their standard deviation and the fraction of the color variance that they explain are large enough; view-dependent
+    light explains the remainder.  If it is not active, the model is bit-identical to one without the module."""
     min_spread: Annotated[float, Field(ge=0)] = MIN_SPREAD
     """With `when: auto`, the smallest standard deviation of log exposures; 0.03 is 3%."""
     min_explained_variance: Annotated[float, Field(ge=0, lt=1)] = MIN_EXPLAINED
@@ -173,7 +173,7 @@ class ColorModel(Settings):
 
     @abstractmethod
     def from_gains(self, log_gains: Floats) -> Floats:
-        """Return the parameters, [columns], that best match gains.  log_gains: logarithms for R, G, and B, [3]."""
+        """Return the parameters, [columns], that best match gains.  log_gains: logarithms of the RGB gains, [3]."""
 
     def penalty(self, row: Floats) -> tuple[float, Floats]:
         """Return a regularization loss on the parameters, and its gradient."""
@@ -279,7 +279,7 @@ class ColorState(ModuleState):
         self.rate = self.settings.rate_schedule(last_step, len(self.names), self.scalars.get(HAS_KNOWN, 1.0) > 0)
 
     def start_from(self, log_gains: Mapping[str, Floats]) -> None:
-        """Initialize the parameters.  log_gains: of red, green, and blue, [3], by view, for views with known gains."""
+        """Initialize the parameters.  log_gains: logarithms of known gains, [3], by view."""
 
     @property
     def color_model(self) -> ColorModel:

@@ -93,11 +93,11 @@ class LearnedSky(ModuleState):
         step.module_losses.append(value)
 
     def backward(self, step: TrainingStep) -> None:
-        """Compute the gradient of the texels that the view shows, [3, texels in the view]."""
+        """Compute the gradient of the texels that are visible in the view, [3, texels in the view]."""
         frame = step.frame
         step.save(self, step.rasterizer.skies.grad_texels(self.sky, frame.camera, frame.transmittance, step.gradient))
 
     def update(self, step: TrainingStep) -> None:
-        """Update the texels that the view shows with Adam."""
+        """Update the texels that are visible in the view, with Adam."""
         rate = at_step(self.settings.rate, step.number)
         step.rasterizer.skies.update(self.sky, step.frame.camera, step.saved_value(self), self._arrays, rate)

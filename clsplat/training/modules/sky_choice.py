@@ -23,7 +23,7 @@ LOG = logging.getLogger("clsplat")
 
 
 def choose_sky(run: Run, settings: ModelSettings, modules: Sequence[TrainingModule]) -> ModelSettings:
-    """Return model settings in which `background: auto` is resolved, without a sky if a module conflicts with it.
+    """Return model settings with `background: auto` resolved; if a module conflicts with a sky, `auto` adds none.
 
     Raises ConfigError if a module conflicts with a sky that the settings require.
     """
@@ -63,7 +63,7 @@ def start_sky(run: Run, source: Model | None) -> None:
 
 
 def sky_reason(run: Run) -> str:
-    """Return the reason for which `auto` added a sky to a run; empty if it did not add one."""
+    """Return the reason why `auto` added a sky to a run; empty if `auto` did not add one."""
     background = run.model_settings.background
     if not isinstance(background, Auto) or background.sky is None:
         return ""
@@ -71,14 +71,14 @@ def sky_reason(run: Run) -> str:
 
 
 def _explain_unknown(run: Run) -> str:
-    """Return the reason for which no sky can be detected in the photographs; empty if it can be detected."""
+    """Return the reason why a sky cannot be detected in the photographs; empty if it can be detected."""
     if run.scene.points is None:
         return "the dataset has no points to tell distant regions from near ones"
     return "the photos have transparency" if is_transparent(run.scene) else ""
 
 
 def _count_skies(run: Run, min_fraction: float) -> tuple[int, int]:
-    """Count the photographs with at least this fraction of sky in their upper third, and all photographs."""
+    """Count the photographs with at least `min_fraction` of sky in their upper third, and all photographs."""
     evidence = _detect_skies(run, run.scene.merge_validation())
     return sum(photo.sky_fraction >= min_fraction for photo in evidence), len(evidence)
 
@@ -97,7 +97,7 @@ def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
 
 
 def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return the initial colors of the map, [side * side, 3], and the mask of the learned texels, [side * side].
+    """Return the initial colors of the sky, [side * side, 3], and the mask of the learned texels, [side * side].
 
     If no photograph shows a sky, all texels are learned, starting from the mean color of the photographs' upper thirds.
     """

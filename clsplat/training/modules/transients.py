@@ -27,10 +27,10 @@ class Transients(TrainingModule):
     """Mask the pixels of a photograph that have far larger residuals than most pixels.
 
     A residual is a pixel's absolute difference, averaged over channels.  A running histogram counts the residuals of
-    all views.  While its 99% quantile exceeds `tail_ratio` times its `quantile`, pixels above `outlier_ratio` times the
-    `quantile` are masked if most of the box around them is above it too.  The box excludes details that the model has
-    not learned yet, which are thin.  Masked pixels are black in both images, as with mask files.  The two ratios are
-    not from a paper.
+    all views; t is the residual at its `quantile`.  While the 99% quantile exceeds `tail_ratio` t, a pixel is masked if
+    its residual exceeds `outlier_ratio` t, and so do most residuals in the box around it.  Because of the box, thin
+    details that the model has not learned yet are not masked.  Masked pixels are black in both the render and the
+    photograph, as with mask files.  The two ratios are not from a paper.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset(
@@ -45,18 +45,18 @@ class Transients(TrainingModule):
     start: Annotated[int, Field(ge=0)]
     """Global step after which pixels are masked, when the model already shows the scene without transients."""
     quantile: Annotated[float, Field(gt=0, lt=1)] = 0.9
-    """Quantile of the residuals that are typical of the static scene."""
+    """Quantile of the histogram below which residuals are typical of the static scene."""
     outlier_ratio: Annotated[float, Field(ge=1)] = 3.0
-    """Residual above which a pixel is masked, as a multiple of that quantile."""
+    """Residual above which a pixel is masked, as a multiple of the residual at `quantile`."""
     tail_ratio: Annotated[float, Field(ge=0)] = 6.0
-    """Size of the 99% quantile, as a multiple of that quantile, above which pixels are masked; 0: always."""
+    """Pixels are masked only while the 99% quantile is above this multiple of the residual at `quantile`; 0: always."""
     box_size: Annotated[float, Field(ge=0, lt=1)] = 0.04
     """Side of the box as a fraction of the photo's width, rounded to an odd number of px, at least 3."""
     decay: Annotated[float, Field(ge=0, lt=1)] = 0.95
-    """Decay of the histogram, per step."""
+    """Factor by which the counts of the histogram are multiplied in each step."""
 
     def threshold(self, scalars: Mapping[str, float], step: int) -> float | None:
-        """Return the residual above which pixels of a global step are masked; None if no pixels are masked."""
+        """Return the residual above which pixels are masked at a global step; None if no pixels are masked."""
         counts = np.cumsum([scalars.get(key, 0.0) for key in KEYS])
         if step <= self.start or counts[-1] == 0:
             return None
