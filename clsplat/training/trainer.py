@@ -83,7 +83,7 @@ class StepTrainer:
     def differentiate(
         self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()
     ) -> ViewGradients:
-        """Return the losses at one view and their gradient, as sums over pixels, without an update.
+        """Return the losses of one view and their gradient, summed over the pixels of each splat, without an update.
 
         Raises ConfigError like `compare`.
         """
@@ -128,7 +128,7 @@ class StepTrainer:
         return ViewLosses(data.frame, comparison, data.losses, step=data)
 
     def backward(self, losses: ViewLosses) -> ViewGradients:
-        """Differentiate the losses that `compare` returned; return them with the gradient, as sums over pixels."""
+        """Differentiate losses of `compare`; return them and the gradient, summed over the pixels of each splat."""
         data, workspace, sum_count = losses.step, self.rasterizer.workspace, self.stats.pixel_sums
         mask = data.planes.mask
         if mask is not None:
@@ -145,7 +145,7 @@ class StepTrainer:
         return ViewGradients(data.frame, data.comparison, data.losses, data.pixel_sums, step=data)
 
     def update(self, gradients: ViewGradients, frozen: Collection[str] = ()) -> None:
-        """Apply the result of `differentiate`: update parameters, moments, statistics, and modules."""
+        """Update the parameters, Adam's moments, the statistics, and the modules with the result of `differentiate`."""
         grad_mean2d = self._update_parameters(gradients, frozen)
         for module in reversed(gradients.step.modules):  # in the order in which the device finished their gradients
             module.update(gradients.step)
@@ -155,9 +155,9 @@ class StepTrainer:
     def _update_parameters(self, view_gradients: ViewGradients, frozen: Collection[str]) -> Array:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  If there are no penalties, frozen parameters, motion,
-        depths, or gradients of several views, a fused kernel updates the parameters without writing gradients to
-        memory.
+        Returns the gradient of the projected means, [2, S] px⁻¹.  A fused kernel updates the parameters without writing
+        gradients to memory, unless the training uses penalties, frozen parameters, motion, depths, or several views per
+        update.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view_gradients.comparison.step

@@ -34,7 +34,8 @@ def curve(
 ) -> str:
     """Return a line chart as SVG, or "" if all points have the same x or the same y.
 
-    logarithmic: use a logarithmic y axis, and omit values that are not positive.  ticks: labels by x; default: numbers.
+    logarithmic: use a logarithmic y axis, and omit values that are not positive.
+    ticks: labels of the x axis, by position; default: numbers.
     """
     axis_lines = [_to_axes(line, logarithmic) for line in lines]
     axis_lines = [line for line in axis_lines if line.points]
@@ -128,7 +129,7 @@ def _dash(line: Line) -> tuple[str, str]:
 
 
 def _legend(lines: Sequence[Line]) -> list[str]:
-    """Return a legend row for each line, in the color of the line, or no rows for a single line."""
+    """Return the rows of a legend, which names each line in its color, or no rows for a single line."""
     rows: list[str] = []
     free_letters = 0
     for i, line in enumerate(lines if len(lines) > 1 else []):
@@ -158,14 +159,20 @@ def _ticks(low: float, high: float, is_integer: bool = False) -> list[float]:
 
 
 def _decade_ticks(low: float, high: float) -> list[float]:
-    """Return the logarithms of 1, 2, and 5 times powers of ten, or of round numbers if fewer than two are in range."""
+    """Return the ticks of a logarithmic axis from 10^low to 10^high, as log10.
+
+    The ticks are 1, 2, and 5 times powers of ten, or round numbers if fewer than two of these are in the range.
+    """
     powers = range(math.floor(low), math.ceil(high) + 1)
     ticks = [t for p in powers for m in (1, 2, 5) if low <= (t := p + math.log10(m)) <= high]
     return ticks if len(ticks) > 1 else [math.log10(tick) for tick in _ticks(10**low, 10**high)]
 
 
 def _tick_labels(values: Sequence[float], is_integer: bool = False) -> list[str]:
-    """Return tick labels with enough digits to be distinct: 100k, 100.2k; for integers 8,040 instead of 8.04k."""
+    """Return tick labels with enough digits to be distinct, such as 100k and 100.2k.
+
+    Integers that are not all multiples of 100 are written in full: 8,040 instead of 8.04k.
+    """
     if is_integer and any(value % 100 for value in values):
         return [f"{value:,.0f}" for value in values]
     candidates = [[_format_number(value, digits) for value in values] for digits in range(3, 10)]
@@ -188,7 +195,7 @@ MAX_POINT_DISTANCE = 3.0  # of points from the center of the cameras, relative t
 
 
 def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floating]) -> list[str]:
-    """Return SVG plans of cameras, and of points around them, [N, 3]: from above and from the side.
+    """Return two SVG plans of cameras and of the points around them, [N, 3]: from above and from the side.
 
     views: groups of views, by name in the legend.  Each camera shows its name on hover.
     The result is empty for fewer than two cameras.
@@ -210,7 +217,10 @@ def camera_plans(views: Mapping[str, Sequence[View]], points: NDArray[np.floatin
 def _plan(
     title: str, views: Mapping[str, Sequence[View]], points: NDArray[np.float64], axes: NDArray[np.float64]
 ) -> str:
-    """Return a plan of points and cameras, drawn as triangles that open forward.  axes: right and down, [2, 3]."""
+    """Return a plan of points, and of cameras as triangles that open in the view direction.
+
+    axes: the directions in the scene that point right and down in the plan, [2, 3].
+    """
     centers = {name: np.stack([view.position for view in group]) @ axes.T for name, group in views.items()}
     positions = np.concatenate([points @ axes.T, *centers.values()])
     low, high = positions.min(axis=0), positions.max(axis=0)

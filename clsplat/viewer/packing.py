@@ -1,13 +1,14 @@
-"""Pack a model into bytes that a page decodes: a header, and planes that hold one component of all splats.
+"""Pack a model into bytes that a page decodes: a header, and planes, each of which holds one component of all splats.
 
-    tables    [4, 256] float32: scale, opacity, color of band 0, color of the other bands; bytes below are indices
-    blocks    [B, 6] float32: smallest t of x, y, z, then step, of each BLOCK consecutive splats
+    tables    [4, 256] float32: values of scale, opacity, color of band 0, and color of the other bands
+    blocks    [B, 6] float32: for each BLOCK consecutive splats, the smallest t of x, y, z, then the steps of t
     positions [6, N] uint8: low bytes of x, y, z, then high bytes; t = smallest + step · (low + 256 high); a position
               is origin + unit · sign(t) (e^|t| - 1), so that precision falls with the distance from the center
     quats     [N] uint32: index of the largest component in bits 31-30; the other three in order, 10 bits each
-    scales    [3, N], opacity [1, N], colors [3 K, N] uint8: indices; colors by coefficient, then channel
-    motion    [columns, N] float16, only of moving models: the columns of clsplat/formats/splats.py, with the rotation
-              as the change of the unit quaternion above, x, y, z, w
+    scales    [3, N], opacity [1, N], colors [3 K, N] uint8: indices into the tables; colors are ordered
+              by coefficient, then channel
+    motion    [columns, N] float16, only of moving models: the columns of clsplat/formats/splats.py, with rotations
+              as changes of the unit quaternion above, in the order x, y, z, w
 
 All values are little-endian.  Splats are sorted into LEVELS parts of decreasing importance, so that the first parts
 show a coarse scene.  Within a part, splats follow a space-filling curve, which keeps the blocks small.
@@ -64,10 +65,10 @@ class PackedModel:
 
 
 def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating] | None = None) -> PackedModel:
-    """Pack a model, with the Gaussians of its sky; the same model gives the same bytes.
+    """Pack a model and the Gaussians of its sky.  The same model gives the same bytes.
 
-    limit: maximum number of splats, of which the most important are kept; None keeps all.  sky_center: as in
-    `with_sky_splats`.
+    limit: maximum number of splats; if the model has more, the most important ones are kept; None keeps all.
+    sky_center: as in `with_sky_splats`.
     """
     scene_count = len(model)
     model = with_sky_splats(model, center=sky_center).baked()
@@ -106,7 +107,7 @@ def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating
 
 
 def _visible_indices(model: Model) -> NDArray[np.intp]:
-    """Return the indices of Gaussians that have finite values, a rotation, and enough opacity to be drawn."""
+    """Return the indices of Gaussians that have finite values, a nonzero quaternion, and enough opacity to be drawn."""
     is_finite = np.logical_and.reduce([np.isfinite(table).all(axis=1) for table in model.tables().values()])
     has_direction = (model.quats.astype(np.float64) ** 2).sum(axis=1) >= MIN_NORM2
     return np.flatnonzero(is_finite & has_direction & (model.opacities > MIN_OPACITY))
@@ -125,7 +126,7 @@ def _draw_order(model: Model, limit: int | None) -> NDArray[np.intp]:
 
 
 def _frame(means: Floats) -> tuple[Floats, float]:
-    """Return the median of points, [3], and their median distance from it along an axis, rounded to float32."""
+    """Return the median position, [3], and the median absolute deviation over all axes, rounded to float32."""
     if not len(means):
         return np.zeros(3), 1.0
     origin = np.median(means, axis=0).astype(np.float32).astype(np.float64)
@@ -139,7 +140,7 @@ def _logarithmic(means: NDArray[np.floating], origin: Floats, unit: float) -> Fl
 
 
 def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
-    """Return the smallest coordinates and the step sizes of each block, [B, 6], and the steps as bytes, [6, N]."""
+    """Return the smallest coordinates and step sizes of blocks, [B, 6], and the coordinates in steps, [6, N] bytes."""
     starts = np.arange(0, len(means), BLOCK)
     low = np.minimum.reduceat(means, starts) if len(means) else np.empty((0, 3))
     high = np.maximum.reduceat(means, starts) if len(means) else np.empty((0, 3))
@@ -151,7 +152,7 @@ def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
 
 
 def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
-    """Pack the three smallest components of unit quaternions (x, y, z, w), [N], after making the largest positive."""
+    """Return the packed unit quaternions, [N], each with the sign that makes its largest component positive."""
     unit = np.roll(quats.astype(np.float64), -1, axis=1)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     largest_index, smaller = smallest_three(unit)
@@ -174,7 +175,10 @@ def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArra
 
 
 def _motion_header(columns: int) -> dict[str, int]:
-    """Return the number of columns, the number of terms of degree 2 or more, and the first rotation column, or 0."""
+    """Return the numbers of columns and of terms of degree 2 or more, and the index of the first rotation column.
+
+    The index is 0 if the motion has no rotation.
+    """
     rotation = motion_fields(columns).get("turn")
     return {"columns": columns, "bends": motion_degree(columns) - 1, "turns": rotation.start if rotation else 0}
 

@@ -32,7 +32,7 @@ def viewpoint_data(viewpoint: Viewpoint) -> dict[str, Any]:
 
 
 def camera_data(view: View) -> dict[str, Any]:
-    """Return the row-major pose and the intrinsics of a view in the format of camera.js."""
+    """Return the row-major pose, the intrinsics, and the timestamp, if any, of a view in the format of camera.js."""
     c = view.camera
     time = {} if view.time is None else {"time": view.time}
     lens = [c.fx, c.fy, c.cx, c.cy, c.width, c.height]
@@ -121,7 +121,7 @@ class Page:
         return low
 
     def write(self, path: Path) -> None:
-        """Write the page.  Raises OutputError if it is too large for browsers, or cannot be written."""
+        """Write the page.  Raises OutputError if the page is too large for browsers or cannot be written."""
         if self.size > MAX_SIZE:
             limit = self.max_splats
             remedy = f"only the {limit:,} most important splats (--splats {limit}), or " if limit else ""
@@ -181,8 +181,8 @@ def view_entries(
 ) -> list[dict[str, Any]]:
     """Return the data of every view of a scene in the format of photographs.js.
 
-    read: returns a photo, RGB at the camera's size.  budget: MB of photos; if they exceed it, only every n-th one is
-    included.  progress: wraps the iteration over views, for example in a progress bar.
+    read: returns a photo, RGB at the camera's size.  budget: maximum size of all photos, MB; if they are larger, only
+    every n-th photo is included.  progress: wraps the iteration over views, for example in a progress bar.
     """
     test_names = {view.name for view in scene.split("test")}
     views: list[dict[str, Any]] = []

@@ -1,8 +1,8 @@
 """Read camera paths from files: nerfstudio's camera_path.json, and the cameras.json of 3DGS.
 
-render_width, render_height  px       fps, seconds      camera_type  perspective
-camera_path  one entry per frame: camera_to_world (16 values, row-major, OpenGL axes), fov (degrees, vertical),
-             aspect, render_time (0 to 1, in a dynamic scene)
+A camera_path.json contains render_width and render_height (px), fps, seconds, camera_type (perspective), and
+camera_path, which has one entry per frame: camera_to_world (16 values, row-major, OpenGL axes), fov (degrees,
+vertical), aspect, and render_time (0 to 1, in a dynamic scene).
 """
 
 import logging
@@ -56,7 +56,7 @@ class CameraPath:
 def read(path: Path, scene: Path | None = None) -> CameraPath:
     """Read a camera path, and transform its poses to the coordinates of a scene folder.
 
-    nerfstudio transforms a scene, and writes the transform to a file, WORLD.  If that file is not next to the path, the
+    nerfstudio transforms a scene, and writes the transform to the file WORLD.  If WORLD is not next to the path, the
     poses are used unchanged, and a warning is logged.
     Raises DataError for other files, invalid values, and cameras that are not perspective.
     """
@@ -134,7 +134,7 @@ def resample(views: Sequence[View], frames: int) -> list[View]:
 
 
 def _camera(size: Size, fov: float) -> Camera:
-    """Return a camera with a vertical field of view, rad."""
+    """Return a camera with this image size and vertical field of view, rad."""
     focal = size[1] / 2 / math.tan(fov / 2)
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
 
@@ -150,14 +150,14 @@ def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
 
 
 def _rows(values: Any) -> Any:
-    """Reshape 16 values to four rows.  Return any other value unchanged, which the caller rejects."""
+    """Reshape 16 values to four rows.  Any other value is returned unchanged, and the caller rejects it."""
     if not isinstance(values, list) or len(values) != 16:
         return values
     return [values[i : i + 4] for i in range(0, 16, 4)]
 
 
 def _world_transform(path: Path, scene: Path | None) -> Any:
-    """Return a function that transforms poses, [3, 4] world to camera, into the coordinates of the scene."""
+    """Return a function that transforms world-to-camera poses, [3, 4], to the coordinates of the scene."""
     file = path.parent / WORLD
     if not file.is_file():
         LOG.warning(

@@ -67,7 +67,7 @@ ALTERNATIVE = "or write images with --out DIR, which any encoder reads"
 
 
 def check_file(path: Path) -> None:
-    """Raise ConfigError if the suffix is unknown or has no encoder, or if the name belongs to a file of a run."""
+    """Raise ConfigError if the suffix is unknown or has no encoder, or if the name is reserved for a file of a run."""
     check_encoder(path)
     check_result_path(path, path.suffix.lower())
 
@@ -85,7 +85,8 @@ def check_encoder(path: Path) -> None:
 def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
     """Yield a function that writes a frame.  At the end of the block, the file is read back as a check.
 
-    size: width and height of a frame, px, both even.  Raises OutputError, and then keeps an existing file.
+    size: width and height of a frame, px, both even.  If the video cannot be written or read back, raises OutputError
+    and does not change an existing file.
     """
     suffix, count = path.suffix.lower(), 0
     with atomic_path(path, suffix) as temporary:
@@ -110,7 +111,7 @@ def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
 def write_video(path: Path, images: Iterable[NDArray[np.generic]], fps: float) -> int:
     """Write images of equal size, [height, width, 3] uint8 or floats in [0, 1]; return their number.
 
-    Raises ConfigError for an invalid name, rate, or size, and ValueError for no images or images of different sizes.
+    Raises ConfigError for an invalid name, rate, or size, and ValueError if there are no images or their sizes differ.
     """
     check_file(path)
     check_fps(fps)

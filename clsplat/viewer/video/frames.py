@@ -32,7 +32,7 @@ class Canvas:
     painter: Painter
 
     def render_layers(self, view: View, names: Collection[str] = LAYERS[:1]) -> Layers:
-        """Render the color, alpha, and the named layers of a view.  Raises NumericError if they are not finite."""
+        """Render the color, the alpha, and the named layers of a view.  Raises NumericError for non-finite values."""
         has_depth = not DEPTH_LAYERS.isdisjoint(names)
         layers = self.painter.render_layers(upload_camera(self.painter.workspace.device, view), has_depth)
         for values in layers.arrays:
@@ -47,7 +47,10 @@ class Canvas:
         return to_8_bits(self.render_layers(view).image)
 
     def depth_range(self, views: Sequence[View]) -> tuple[float, float]:
-        """Return near and far, scene units: quantiles of the depths in a sample of views, or 1 and 2 without depths."""
+        """Return the near and far depths, scene units, which are quantiles of the depths in a sample of views.
+
+        Returns 1 and 2 if nothing in these views is opaque.
+        """
         depths = []
         for i in np.unique(np.linspace(0, len(views) - 1, min(PROBES, len(views))).round().astype(int)):
             view, long_side = views[i], max(views[i].camera.width, views[i].camera.height)
@@ -63,7 +66,7 @@ class Canvas:
 
 
 def layer_image(layers: Layers, layer: str, depths: tuple[float, float]) -> Image:
-    """Return a layer, named in LAYERS, as 8-bit RGB, [height, width, 3].  depths: near and far, scene units."""
+    """Return a layer, one of LAYERS, as 8-bit RGB, [height, width, 3].  depths: near and far, scene units."""
     if layer == "color":
         return to_8_bits(layers.image)
     if layer == "alpha":
@@ -75,9 +78,9 @@ def layer_image(layers: Layers, layer: str, depths: tuple[float, float]) -> Imag
 
 
 def layer_values(layers: Layers, layer: str) -> NDArray[np.float32]:
-    """Return a layer, named in LAYERS, as floats, [height, width] or [height, width, 3].
+    """Return a layer, one of LAYERS, as floats, [height, width] or [height, width, 3].
 
-    Raises ConfigError for the median depth of a field.
+    Raises ConfigError for the median depth of a field, because fields have only a mean depth.
     """
     array = {"color": layers.image}.get(layer, getattr(layers, layer, None))
     if array is None:
@@ -88,8 +91,8 @@ def layer_values(layers: Layers, layer: str) -> NDArray[np.float32]:
 def depth_normals(depth: NDArray[np.float32], view: View) -> NDArray[np.float32]:
     """Return the unit normals of a depth image, in the axes of the scene, toward the camera, [height, width, 3].
 
-    They are computed from the differences between the pixels above and below, and left and right.  They are 0 where a
-    neighbor has no depth, or a depth that differs by more than MAX_STEP.
+    The normal of a pixel is computed from the points at its left and right neighbors and at its upper and lower
+    neighbors.  It is 0 where a neighbor has no depth, or a depth that differs by more than MAX_STEP.
     """
     camera, (height, width) = view.camera, depth.shape
     x = (np.arange(width) + 0.5 - camera.cx) / camera.fx

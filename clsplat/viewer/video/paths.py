@@ -39,7 +39,7 @@ class Rig:
 
     @classmethod
     def from_views(cls, views: Sequence[View], points: Floats) -> "Rig":
-        """Return a rig without outlier cameras and non-finite points.  Raises DataError if there is no view."""
+        """Return a rig without outlier cameras or non-finite points.  Raises DataError if there is no view."""
         if not views:
             raise DataError("a camera path needs the cameras of a scene, but this scene has none; use another one")
         is_outlier = outlier_cameras(views)
@@ -144,7 +144,7 @@ def tour_order(rig: Rig) -> Indices:
 def smooth(poses: Floats, frames: int, distance: float) -> Floats:
     """Return evenly spaced samples of a B-spline of degree 5 near the poses, [frames, 9].
 
-    poses: [V, 9], positions, targets at `distance`, and up vectors.
+    poses: [V, 9], each a position, a target at `distance` from the position, and an up vector.
     """
     weights = np.repeat([1.0, 1.0, UP_WEIGHT * distance], 3)
     weighted_poses = poses * weights
@@ -240,26 +240,26 @@ def check_fps(fps: float) -> float:
 
 
 def even_size(camera: Camera) -> Size:
-    """Return the size of a camera's image, rounded down to even sides within the bounds of a video."""
+    """Return the size of a camera's image with even sides, scaled down if it exceeds the maximum size of a video."""
     factor = min(1.0, SIDES[1] / max(camera.width, camera.height))
     width, height = (max(SIDES[0], int(side * factor) // 2 * 2) for side in (camera.width, camera.height))
     return width, height
 
 
 def same_area(camera: Camera, size: Size) -> Camera:
-    """Return a camera with this image size and a centered principal point that views an equally large area."""
+    """Return a camera with another image size, a centered principal point, and a field of view of the same area."""
     width, height = size
     scale = math.sqrt(width * height / (camera.width * camera.height))
     return Camera(width, height, camera.fx * scale, camera.fy * scale, width / 2, height / 2)
 
 
 def fit_inside(camera: Camera, size: Size) -> Camera:
-    """Return a camera with another image size whose image contains the entire original image at its center."""
+    """Return a camera with another image size, whose image contains the entire original image at its center."""
     return center_inside(camera, size, fit_scale(camera, size))
 
 
 def center_inside(camera: Camera, size: Size, scale: float) -> Camera:
-    """Return a camera with another image size whose image shows the original one, scaled, at its center."""
+    """Return a camera with another image size, whose image shows the original one at its center, scaled by `scale`."""
     width, height = size
     left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
     return Camera(
@@ -286,8 +286,8 @@ MIN_AGREEMENT = 0.5  # length of the mean view direction below which the cameras
 def ellipse(rig: Rig, frames: int, size: Size) -> list[View]:
     """Circle the focus on an ellipse that fits the cameras, or swing back and forth if they are all on one side.
 
-    The half axes are the 90th percentiles of the offsets along the principal axes of the horizontal plane, as in
-    Mip-NeRF 360 (Barron et al. 2022); the height is the mean height.
+    The half axes are the 90th percentiles of the cameras' offsets from the focus along their horizontal principal axes,
+    as in Mip-NeRF 360 (Barron et al. 2022).  The height is the mean height of the cameras.
     """
     axes, offsets, height = _ring_axes(rig)
     half_axes = np.percentile(np.abs(offsets), PERCENTILE, axis=0)
@@ -316,7 +316,7 @@ def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
 def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
     """Circle the mean camera position twice, looking at one point, for forward-facing scenes.
 
-    Formulas of Local Light Field Fusion (Mildenhall et al. 2019).
+    The formulas are from Local Light Field Fusion (Mildenhall et al. 2019).
     """
     forward, center = rig.forwards.mean(axis=0), rig.positions.mean(axis=0)
     if np.linalg.norm(forward) < MIN_AGREEMENT:
@@ -346,7 +346,7 @@ def fly_through(rig: Rig, frames: int, size: Size) -> list[View]:
 
 
 def views(rig: Rig, frames: int, size: Size) -> list[View]:
-    """Return at most `frames` of the photos' cameras, evenly spaced, with the intrinsics of the photos."""
+    """Return at most `frames` of the views, at even intervals in their order, with their images fitted into `size`."""
     indices = np.unique(np.linspace(0, len(rig.views) - 1, min(frames, len(rig.views))).round().astype(int))
     return [
         replace(rig.views[i], camera=fit_inside(rig.views[i].camera, size), lens=None, mask_path=None) for i in indices
@@ -376,7 +376,10 @@ PATHS: dict[str, Callable[[Rig, int, Size], list[View]]] = {
 
 
 def look_at_targets(positions: Floats, targets: Floats, ups: Floats, rig: Rig, size: Size) -> list[View]:
-    """Return views at positions that look at targets, [F, 3] each.  Raises DataError if a view looks along up."""
+    """Return one view per position, which looks at the target in the same row.
+
+    positions, targets, ups: [F, 3] each.  Raises DataError if a view direction is parallel to its up vector.
+    """
     camera = same_area(rig.camera, size)
     try:
         return [
@@ -388,7 +391,10 @@ def look_at_targets(positions: Floats, targets: Floats, ups: Floats, rig: Rig, s
 
 
 def _ring_axes(rig: Rig) -> tuple[Floats, Floats, Floats]:
-    """Return the horizontal principal axes, [2, 3], and the cameras' offsets along these, [V, 2], and along up, [V]."""
+    """Return the horizontal principal axes of the cameras, [2, 3], and the cameras' offsets from the focus.
+
+    The offsets are along the two axes, [V, 2], and along up, [V].
+    """
     offsets = rig.positions - rig.focus
     heights = offsets @ rig.up
     flat = offsets - heights[:, None] * rig.up
@@ -399,7 +405,10 @@ def _ring_axes(rig: Rig) -> tuple[Floats, Floats, Floats]:
 
 
 def _sweep_angles(angles: Floats, frames: int) -> Floats:
-    """Return the angle of each frame: a full turn, or back and forth if the cameras leave a gap.  angles: [V], rad."""
+    """Return the angle of each frame: a full turn, or a swing back and forth if the cameras leave a wide gap.
+
+    angles: of the cameras, [V], rad.
+    """
     gap, start = _widest_gap(angles)
     phase = 2 * np.pi * np.arange(frames) / frames
     if gap < MAX_GAP:

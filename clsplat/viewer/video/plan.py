@@ -59,8 +59,10 @@ def with_times(views: Sequence[View], times: Times) -> list[View]:
 
 
 def assign_times(views: Sequence[View], times: Times | None, is_moving: bool) -> list[View]:
-    """Return views with timestamps: the requested ones, the existing ones, or the full range for a moving model.
+    """Return views with the requested timestamps.
 
+    If none are requested, existing timestamps are kept, unless the model moves and a view has no timestamp; then the
+    timestamps of all views span the full range.
     is_moving: whether the model moves.  Raises ConfigError if timestamps were requested for a model that does not move.
     """
     if times is not None:
@@ -175,12 +177,12 @@ class VideoPlan:
 def plan_video(
     request: VideoRequest, scene: Scene | None, points: Floats, is_moving: bool = False, origin: Floats | None = None
 ) -> VideoPlan:
-    """Plan the video of a scene.  points: [M, 3], means of a model, or points of the scene.
+    """Plan the video of a scene.  points: [M, 3], the means of a model or the points of the scene.
 
-    is_moving: whether the model moves; origin: the points' origin, [3] world coordinates; default: the scene's origin.
+    is_moving: whether the model moves; origin: world coordinates of the origin of `points`, [3]; default: the scene's.
     Without a scene, the paths ellipse, orbit, and fixed circle around the points, with up at -y.
-    Raises ConfigError if the path needs a scene and there is none, or if times are set without motion, and DataError if
-    the path is impossible in the scene.
+    Raises ConfigError if the path needs a scene and there is none, or if times are set for a model that does not move,
+    and DataError if the path is impossible in the scene.
     """
     plan = _plan_path(request, scene, points, scene.origin if scene and origin is None else origin)
     return replace(plan, views=assign_times(plan.views, request.times, is_moving))
@@ -214,7 +216,7 @@ def _plan_path(request: VideoRequest, scene: Scene | None, points: Floats, origi
 
 
 def layer_files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
-    """Return the video file of each layer; `video` is the file of the color.  Raises ConfigError for invalid names."""
+    """Return the video file of each layer; `video` is the file of `color`.  Raises ConfigError for invalid names."""
     files = {
         layer: video if layer == LAYERS[0] else video.with_name(f"{video.stem}_{layer}{video.suffix}")
         for layer in layers
@@ -227,7 +229,10 @@ def layer_files(video: Path, layers: Sequence[str]) -> dict[str, Path]:
 def render_video(
     canvas: Canvas, plan: VideoPlan, videos: Mapping[str, Path], side: Side | None, progress: Progress
 ) -> None:
-    """Render the views to videos, one per layer.  side: returns the image to the right of the color layer."""
+    """Render the views to videos, one per layer.
+
+    side: returns the image that the color video shows to the right of a view.
+    """
     full_width = plan.size[0] * (1 if side is None else 2)
     check_size((full_width, plan.size[1]))
     depths = (0.0, 0.0) if DEPTH_LAYERS.isdisjoint(videos) else canvas.depth_range(plan.views)
