@@ -19,7 +19,7 @@ TABLE = ViewTable("responses", (), ("center_x", "center_y", "a", "b", "c", *CURV
 
 
 class CameraResponse(TrainingModule):
-    """Learn vignetting and response curves together with the Gaussians, one set per camera.
+    """Learn vignetting and response curves together with the Gaussians, one set of parameters per camera.
 
     A pixel x of the render becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
     (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and

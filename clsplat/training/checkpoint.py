@@ -389,7 +389,7 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
 
 
 def rename_damaged(out: Path, restored_path: Path | None) -> None:
-    """Rename damaged checkpoints that are newer than the restored one, so that `save` does not count them."""
+    """Rename damaged checkpoints newer than the restored one, so that `save` does not count them toward `keep`."""
     files = list_files(out)
     for damaged_file in files[files.index(restored_path) + 1 :] if restored_path else ():
         try:

@@ -31,7 +31,7 @@ Harmonics = Literal["auto", "device", "host"]  # memory of the bands above 0; au
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """The device memory that training needs and has, in bytes."""
+    """The device memory that training needs, and the memory that the device has, in bytes."""
 
     gaussian: int  # per Gaussian, in tables and the frame
     pair: int  # per pair
@@ -42,7 +42,7 @@ class MemoryPlan:
     host: int = 0  # per Gaussian, in the memory of the host
 
     def required_bytes(self, gaussians: int) -> int:
-        """Return the bytes for a number of Gaussians, including growth and a copy of the largest table."""
+        """Return the bytes that Gaussians need, including spare capacity for growth and a copy of the largest table."""
         return self.fixed + int(gaussians * self._per_gaussian)
 
     @property

@@ -38,7 +38,7 @@ class Records:
     """
 
     def __init__(self, out: Path, require_lock: Callable[[], None] = lambda: None) -> None:
-        """require_lock: raises OutputError if the run no longer holds the folder's lock."""
+        """require_lock: function that raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
         self._require_lock = require_lock
         self.path, self.trial = out / RECORDS, out / TRIAL
@@ -81,7 +81,7 @@ class Records:
         self.line_count += 1
 
     def write(self) -> None:
-        """Append the buffered lines, and sync the file, because a checkpoint contains their number.
+        """Append the buffered lines, and sync the file, because a checkpoint contains the number of lines.
 
         If this raises OutputError, the lines stay buffered, and the file is unchanged.
         """
@@ -93,7 +93,7 @@ class Records:
 
     @contextmanager
     def stage(self) -> Iterator[None]:
-        """Write the lines that the block adds when it ends; drop them if it fails."""
+        """When the block ends, write the lines that it added; if it fails, drop them."""
         lines, pending = self.line_count, len(self._pending)
         try:
             yield

@@ -130,7 +130,7 @@ class StatusFile:
     """
 
     def __init__(self, out: Path, require_lock: Callable[[], None] = lambda: None, **values: Any) -> None:
-        """require_lock: raises OutputError if the run no longer holds the folder's lock."""
+        """require_lock: function that raises OutputError if the run no longer holds the folder's lock."""
         self.out = out
         self.lock_error: OutputError | None = None  # the error that `require_lock` raised
         self._require_lock = require_lock
@@ -165,7 +165,7 @@ class StatusFile:
         self._start_heartbeat()
 
     def require_lock(self) -> None:
-        """Raise OutputError if the run no longer holds the lock of its folder; called before each write to it."""
+        """Raise OutputError if the run no longer holds the lock of its folder; called before each write there."""
         try:
             self._require_lock()
         except OutputError as error:
@@ -204,7 +204,7 @@ class StatusFile:
         self.note(progress=StageProgress(done=done, total=total, unit=unit), **values)
 
     def counted(self, items: Iterable[Item], unit: str, total: int) -> Iterator[Item]:
-        """Yield the items and report the progress.  An item is done when the next one is requested."""
+        """Yield the items and report the progress.  An item counts as done when the next one is requested."""
         for number, item in enumerate(items):
             self.count(unit, number, total)
             yield item

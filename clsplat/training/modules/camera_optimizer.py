@@ -48,8 +48,8 @@ class CameraOptimizer(TrainingModule):
     Each photograph has a rotation vector and a translation in world axes, trained by Adam from 0.  The camera rotates
     about the point on its optical axis at the median depth of the dataset's points, or at the scene's extent if
     there are too few points.
-    A step updates its photograph and then subtracts the means over all photographs, because losses cannot detect a
-    motion that all cameras share with the Gaussians.  The world filter, the extent, and rules that compare the model
+    A step updates its photograph's pose and then subtracts the means over all photographs, because losses cannot detect
+    a motion that all cameras share with the Gaussians.  The world filter, the extent, and rules that compare the model
     with photographs use the dataset's cameras.
 
     With `focal`, the photographs of one camera share a factor for both of its focal lengths; the principal point is
@@ -141,7 +141,10 @@ class PoseChange:
     depth: float  # scene units
 
     def apply_to(self, world_to_camera: Floats) -> Floats:
-        """Return the changed pose, [3, 4], with rotation W exp([rotation]x).  Only the translation moves the pivot."""
+        """Return the changed pose, [3, 4].  Only the translation moves the pivot.
+
+        The changed rotation is W exp([rotation]x), where W is the rotation of `world_to_camera`.
+        """
         old = world_to_camera[:, :3]
         new = old @ scipy.spatial.transform.Rotation.from_rotvec(self.rotation).as_matrix()
         pivot = self.depth * old[2] - old.T @ world_to_camera[:, 3]
@@ -171,8 +174,8 @@ def _rotation_vector_gradient(vector: Floats, grad_rotation: Floats) -> Floats:
 class CameraState(ModuleState):
     """The learned changes of the training views' poses and of their cameras' focal lengths.
 
-    All sizes of a view share a row.  A single factor scales both focal lengths.  Views with the same lens or the same
-    pinhole camera in the dataset share a camera, which has the name of the first such view.
+    All image sizes of a view share a row of parameters.  A single factor scales both focal lengths.  Views with the
+    same lens or the same pinhole camera in the dataset share a camera, which has the name of the first such view.
     """
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "active"
@@ -279,7 +282,7 @@ class CameraState(ModuleState):
         return replace_cameras(scene, [replace(view, world_to_camera=pose(view)) for view in views])
 
     def write(self, run: Run) -> None:
-        """Write the pose of each photograph, and log the distances that the cameras moved."""
+        """Write the pose of each photograph, and log how far the cameras have moved."""
         views, names = self.apply_to(run.original).views, {view.name for view in self.views}
         cameras = self.zoomed_cameras
         data = {

@@ -77,7 +77,7 @@ class Distractors(TrainingModule):
 
 
 class DistractorsState(ModuleState):
-    """The Gaussians of each photograph on the device, with a separate Adam for each photograph."""
+    """The Gaussians of each photograph on the device, with a separate Adam optimizer for each photograph."""
 
     def __init__(self, settings: Distractors, views: Sequence[View], rasterizer: Rasterizer) -> None:
         """views: the training views; rasterizer: used only here, since its frames share buffers."""

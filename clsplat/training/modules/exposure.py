@@ -63,7 +63,7 @@ class Appearance(TrainingModule):
     """Color parameters of each photograph, learned together with the Gaussians, with zero mean over the photographs.
 
     Without this constraint, the colors of the model would drift: the Gaussians can undo a change that all photographs
-    share, so that no loss detects it.
+    share, and then no loss detects it.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate"})
@@ -85,9 +85,9 @@ class Appearance(TrainingModule):
     their standard deviation and the fraction of the color variance that they explain are large enough; view-dependent
     light explains the remainder.  If it is not active, the model is bit-identical to one without the module."""
     min_spread: Annotated[float, Field(ge=0)] = MIN_SPREAD
-    """With `when: auto`, the smallest standard deviation of log exposures; 0.03 is 3%."""
+    """With `when: auto`, the standard deviation of log exposures must exceed this; 0.03 is 3%."""
     min_explained_variance: Annotated[float, Field(ge=0, lt=1)] = MIN_EXPLAINED
-    """With `when: auto`, the smallest fraction of the color variance of points that exposures explain."""
+    """With `when: auto`, the fraction of the points' color variance that exposures explain must exceed this."""
     chosen: Literal["on", "off"] | None = None
     """Written by a run: the choice of `auto`."""
     reason: str = ""
@@ -219,7 +219,7 @@ class Affine(ColorModel):
 
     type: Literal["affine"] = "affine"
     weight: Annotated[float, Field(ge=0)] = 1e-2
-    """Weight of a loss that pulls the matrix to the identity: the sum of squared differences, excluding offsets."""
+    """Weight of a loss that pulls the matrix toward the identity: the sum of squared differences, excluding offsets."""
 
     def matrix(self, row: Floats) -> Floats:
         return IDENTITY + row.reshape(3, 4)
@@ -264,7 +264,7 @@ class ColorState(ModuleState):
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "kept"
 
     def __init__(self, settings: Appearance, views: Sequence[str]) -> None:
-        """views: names of the training views by index.  All sizes of a view share a row."""
+        """views: names of the training views by index.  All image sizes of a view share a row of parameters."""
         super().__init__()
         self.settings, self.views, self.names = settings, views, tuple(dict.fromkeys(views))
         self.rate: Schedule = 0.0
