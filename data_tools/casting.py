@@ -56,7 +56,7 @@ class World:
         return out
 
     def shade(self, points: Array, index: NDArray[np.intp], sample: int) -> Array:
-        """Return the light that leaves surface points, [3, R], from one shadow ray and one sky ray per point.
+        """Return the light that leaves surface points, [3, R], computed with one shadow ray and one sky ray per point.
 
         index: for each point, the index of its shape, [R]
         sample: the index of the sample in its pixel, which selects the directions of these rays

@@ -1,4 +1,4 @@
-"""Download public datasets by name, verify and unpack them, and continue interrupted downloads."""
+"""Download public datasets by name, verify and unpack them, and resume interrupted downloads."""
 
 import shutil
 import tarfile
@@ -28,7 +28,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class WebArchive:
-    """An archive on the web.  If it has no checksum here, `fetch` prints the checksum of the download."""
+    """An archive on the web.  If `sha256` is None, `fetch` prints the checksum of the download."""
 
     url: str
     license: str
@@ -75,7 +75,7 @@ def find_source(name: str) -> WebArchive:
 def fetch(source: WebArchive, out: Path, report: Report = print) -> Path:
     """Download an archive, unpack it as the folder `out`, and return `out`.  An existing folder is not changed.
 
-    An interrupted download is kept next to `out` as a `.part` file, and the next call continues it.
+    An interrupted download is kept next to `out` as a `.part` file, and the next call resumes it.
     Raises DataError if the download fails, if the checksum differs, or if a file would be written outside `out`.
     """
     if path_exists(out):
@@ -175,7 +175,10 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
 
 @contextmanager
 def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], BinaryIO]]]]:
-    """Yield the name, the size, and an open function for each regular file.  Links and devices are skipped."""
+    """Yield a list with the name and size of each regular file of an archive, and a function that opens the file.
+
+    Links and devices are skipped.
+    """
     if zipfile.is_zipfile(archive):
         with zipfile.ZipFile(archive) as zip_file:
             yield [

@@ -61,7 +61,7 @@ def write_lpips(out: Path, net: Net, package: Path | None = None) -> None:
 
 
 def read_weights(data: bytes) -> Weights:
-    """Return the float32 arrays of a pickle of nested dictionaries, without calling any function that it names.
+    """Return the float32 arrays of a pickle of nested dictionaries, without calling any function named in the pickle.
 
     Raises DataError for a pickle that contains anything else.
     """

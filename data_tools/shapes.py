@@ -36,7 +36,7 @@ def unit(v: Array) -> Array:
 
 
 def align(axis: Array, x: float, y: float, z: Array | float) -> Array:
-    """Rotate (x, y, z) by a rotation of the z axis to the unit columns `axis` (Duff et al. 2017)."""
+    """Rotate vectors (x, y, z) by a rotation that maps the z axis to the unit columns `axis` (Duff et al. 2017)."""
     sign = np.copysign(1.0, axis[2])
     a = -1 / (sign + axis[2])
     b = axis[0] * axis[1] * a
@@ -102,7 +102,7 @@ class Shape:
         raise NotImplementedError
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Return the distances (enter, leave) of rays, which are in local coordinates."""
+        """Return the distances (enter, leave) at which rays, in local coordinates, enter and leave the shape."""
         raise NotImplementedError
 
     def local_normal(self, points: Array) -> Array:
@@ -121,7 +121,7 @@ class Shape:
         return rotate(self.axes, points - np.array(self.center)[:, None])
 
     def intersect(self, origins: Array, directions: Array) -> Array:
-        """Return the distance along each ray to the next surface, [R], or inf for a miss."""
+        """Return the distance along each ray to the surface of the shape, [R], or inf for a miss."""
         offset = origins - np.array(self.center)[:, None]
         along, square = dot(offset, directions), dot(offset, offset) - self.reach**2
         near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # through the bounding sphere

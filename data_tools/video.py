@@ -31,7 +31,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     """Split a video into `frames` parts of equal motion and write the sharpest frame of each.  Return their number.
 
     long_side: the maximum width and height of the images, px
-    times: also write times.json, the index of each frame in the video, for a dynamic scene
+    times: whether to also write times.json with the index of each frame in the video, for a dynamic scene
 
     The format is PNG because a second lossy compression changes features and colors.  An interrupted call can be
     repeated; it keeps the frames that were extracted from the same video with the same settings.
@@ -115,12 +115,10 @@ def _is_readable(path: Path) -> bool:
 def sharpest(sharpness: Sequence[float], motion: Sequence[float], parts: int) -> list[int]:
     """Return the index of the sharpest frame in each of at most `parts` parts of equal motion.
 
-    Of equally sharp frames, the first is chosen.
+    motion: motion of each frame relative to the previous one, px
 
-    motion: of each frame relative to the previous one, px
-
-    While the camera is still, only one frame is chosen.  If it is always still, all parts have equally many
-    frames.
+    Of equally sharp frames, the first is chosen.  While the camera is still, at most one frame is chosen.
+    If the camera never moves, all parts have the same number of frames.
     """
     path = np.cumsum(np.maximum(np.asarray(motion, float) - STILL, 0))
     if not path[-1] > 0:

@@ -51,7 +51,7 @@ class AlignOptions:
 
 @dataclass(frozen=True)
 class Subject:
-    """The scene, the model, or both, to align.  Their coordinates are relative to the same origin."""
+    """The scene, the model, or both that are to be aligned.  Their coordinates are relative to the same origin."""
 
     path: Path
     scene: Scene | None = None
@@ -59,9 +59,10 @@ class Subject:
 
     @classmethod
     def read(cls, path: Path, scene: Path | None, needs_model: bool) -> "Subject":
-        """Read a dataset folder, a run folder, or a model file.  A model file may have a scene.
+        """Read a dataset folder, a run folder, or a model file.
 
-        Raises ConfigError, DataError.
+        scene: the dataset folder of a model; default: that of its run, if any; must be None if `path` is a dataset
+        folder.  Raises ConfigError, DataError.
         """
         if path.is_dir() and not has_pipeline(path) and not model_file(path).is_file():
             if scene is not None:
@@ -78,7 +79,7 @@ class Subject:
 
     @property
     def origin(self) -> Floats:
-        """The world coordinates of zero, [3]."""
+        """The world coordinates of the origin of the scene and the model, [3]."""
         return np.asarray(self.scene.origin if self.scene else self.model.origin if self.model else np.zeros(3))
 
     def require_scene(self, option: str) -> Scene:
@@ -244,7 +245,7 @@ def align(
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """Format the errors of an alignment as a table of its points and distances."""
+    """Format the errors of the points and distances of an alignment as a text table."""
     rows = [["point", "dx", "dy", "dz", "distance", "pixels", ""]] if result["points"] else []
     for point in result["points"]:
         pixels = max((mark["error"] for mark in point["marks"] if not mark["is_outlier"]), default=None)

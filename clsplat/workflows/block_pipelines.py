@@ -59,7 +59,8 @@ def block_pipeline(
 ) -> Pipeline:
     """Return the pipeline of a block: from its initial Gaussians to its model, cropped to its cell.
 
-    extent: of the full scene, in scene units; fraction: of the training steps, with rates as in `_with_fewer_steps`.
+    start: file of the initial Gaussians; extent: of the full scene, in scene units; fraction: of the training steps,
+    with learning rates as in `_with_fewer_steps`.
     """
     data, stage_count, cell = pipeline.resolved(), _count_until_last_edit(pipeline), block.box.model_dump()
     stages = [_limit_growth(stage, block) for stage in _with_start(data["stages"][:stage_count], start)]
@@ -93,7 +94,7 @@ def without_start(pipeline: Pipeline) -> Pipeline:
 
 
 def _with_fewer_steps(settings: PipelineFile, fraction: Fraction) -> PipelineFile:
-    """Return settings with a fraction of the steps, and learning rates divided by its square root.
+    """Return settings with a fraction of the steps, and with learning rates divided by the square root of the fraction.
 
     Adam divides gradients by their RMS over steps.  A Gaussian visible in a fraction p of the views has gradients in
     that fraction of the steps, and each step moves it in proportion to 1 / √p.  In a block, p is 1 / fraction times as
@@ -125,7 +126,7 @@ def _with_start(stages: list[Any], file: Path) -> list[Any]:
 
 
 def _limit_growth(stage: dict[str, Any], block: Block) -> dict[str, Any]:
-    """Return a stage of a resolved pipeline with densification limited as in `_limit_densify`."""
+    """Return a stage of a resolved pipeline, in which `_limit_densify` has limited all densification."""
     ((name, fields),) = stage.items()
     if name == "densify":
         densify = _limit_densify(Densify.model_validate(fields), block).model_dump(mode="json")
@@ -136,7 +137,10 @@ def _limit_growth(stage: dict[str, Any], block: Block) -> dict[str, Any]:
 
 
 def _limit_densify(densify: Densify, block: Block) -> Densify:
-    """Limit a densify stage to a block's growth box, and the number of Gaussians in proportion to the block's pairs."""
+    """Return a densify stage limited to a block's growth box and to a share of the maximum number of Gaussians.
+
+    The share is the block's fraction of all (tile, Gaussian) pairs.
+    """
     updates: dict[str, Any] = {"inside": block.growth_box}
     if densify.max_gaussians is not None:
         updates["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)

@@ -145,7 +145,7 @@ class Blocks:
             raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")
 
     def identity(self) -> dict[str, Any]:
-        """Return the inputs that identify the folder: options, and hashes of photos, pipelines, and coarse model."""
+        """Return the inputs that identify the work: options, and hashes of the photos, pipelines, and coarse model."""
         pipelines = {"pipeline": without_start(self.pipeline), **({"coarse": self.coarse} if self.coarse else {})}
         contents = {
             name: json.dumps(with_content_hashes(pipeline), sort_keys=True) for name, pipeline in pipelines.items()
@@ -185,8 +185,8 @@ class Blocks:
     def train(self, partition: Partition) -> list[tuple[Block, Path]]:
         """Train the unfinished blocks; return all blocks with their model files, in order.
 
-        A block without Gaussians has no model.  A failed block does not stop the others; an error at the end names
-        the first failure and has its exit code.
+        A block without Gaussians has no model.  A failed block does not stop the others; the error raised at the
+        end names the first failure and has its exit code.
         """
         files, failures = [], Failures("blocks")
         pipelines = {block.name: self.block_pipeline(block, partition) for block in partition.blocks}
@@ -256,8 +256,11 @@ def train_in_blocks(
 ) -> dict[str, Any]:
     """Train a scene in blocks in a folder; return the manifest and `run`, the folder of the merged model.
 
-    Finished parts of an earlier call are kept, and interrupted ones resume.  only_plan: stop after the partition;
-    execution: where blocks are trained, as cells of a sweep store.  Raises ClsplatError, which names a failed block.
+    Finished parts of an earlier call are kept, and interrupted ones resume.  If a block fails, raises ClsplatError,
+    which names the block.
+
+    only_plan: whether to stop after the partition
+    execution: where blocks are trained, as cells of a sweep store; by default, in this process
     """
     blocks = Blocks(scene, out, plan or BlocksPlan(), device, execution)
     with claim_folder(out, blocks.identity(), RECORD, "a scene in blocks", "another --out"):
@@ -285,9 +288,9 @@ NOTE = "memory is at the start of training; times range from no growth to growth
 
 
 def table(manifest: dict[str, Any]) -> str:
-    """Format a manifest as text.  MiB: device memory at the start of training.
+    """Format a manifest as a text table.  The column `initial MiB` is the device memory at the start of training.
 
-    Training times, if there are any, are ranges: without growth, and with the maximum number of Gaussians.
+    Training times, if there are any, are ranges: from no growth to growth up to the maximum number of Gaussians.
     """
     scene_row = [
         "scene",

@@ -56,7 +56,7 @@ class Ladder:
         return self.out / f"keep_{round(100 * keep):02d}"
 
     def train_sog(self, file: Path, name: str, degree: int, quality: str) -> Path:
-        """Fine-tune a rung with the SH palette and rounding of a SOG; return the SOG file."""
+        """Fine-tune a rung with the SH palette and the rounding of the SOG format; return the SOG file."""
         values = {"init.file": str(file.resolve()), "reduce_sh.degree": degree}
         values |= {f"stages.{i}.quality": quality for i, stage in enumerate(SOG_STAGES) if stage == PALETTE}
         pipeline = self.tuning.pipeline(SOG_STAGES, values, file=SOG, quality=quality)
@@ -85,7 +85,7 @@ EXPECTED = "expected a size such as 5MB, or a loss such as -0.1dB"
 
 @dataclass(frozen=True)
 class Entry:
-    """A file of the search with its measurements."""
+    """A file that the search wrote, and its measurements."""
 
     file: str  # in the folder of the search
     keep: float  # fraction of the Gaussians
@@ -107,7 +107,7 @@ class CompressionTarget:
 
     @classmethod
     def parse(cls, text: str) -> "CompressionTarget":
-        """Read '5MB' (1 MB = 10^6 bytes; MiB = 2^20) or '-0.1dB'.  Raises ConfigError."""
+        """Parse text such as '5MB' (1 MB = 10^6 bytes; 1 MiB = 2^20 bytes) or '-0.1dB'.  Raises ConfigError."""
         match = re.fullmatch(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*([a-z]+)\s*", text, re.IGNORECASE | re.ASCII)
         unit = match[2].lower() if match else ""
         if match is None or unit not in (*UNITS, "db"):
@@ -130,26 +130,32 @@ class CompressionTarget:
         return entry.psnr >= psnr + (self.psnr_change or 0)
 
     def best(self, entries: Sequence[Entry], psnr: float) -> Entry | None:
-        """Return the best file for a size, or the smallest for a loss; None if no file meets the target."""
+        """Return a file that meets the target, or None if there is none.
+
+        The file has the highest PSNR if the target is a size, and the smallest size if the target is a loss.
+        """
         candidates = [entry for entry in entries if self.is_met(entry, psnr)]
         if self.max_bytes is not None:
             return max(candidates, key=lambda entry: (entry.psnr, -entry.bytes), default=None)
         return min(candidates, key=lambda entry: (entry.bytes, -entry.psnr), default=None)
 
     def nearest(self, entries: Sequence[Entry]) -> Entry:
-        """Return the file closest to the target: the smallest one for a size, or the best one for a loss."""
+        """Return the file closest to a target that no file meets.
+
+        It is the smallest file if the target is a size, and the one with the highest PSNR if the target is a loss.
+        """
         smallest, best = min(entries, key=lambda entry: entry.bytes), max(entries, key=lambda entry: entry.psnr)
         return best if self.max_bytes is None else smallest
 
     @property
     def remedy(self) -> str:
-        """The remedy if no file meets the target."""
+        """The advice for the user if no file meets the target."""
         if self.max_bytes is not None:
             return "give a larger size, or smaller fractions with --keep"
         return "allow a larger loss, or train longer with --steps"
 
     def is_decided(self, rung: Sequence[Entry], psnr: float) -> bool:
-        """Return whether the search can stop, because every file of a rung is small enough, or none is good enough."""
+        """Return whether the search can stop: every file of a rung meets a target size, or none meets a target loss."""
         results = [self.is_met(entry, psnr) for entry in rung]
         return all(results) if self.max_bytes is not None else not any(results)
 
@@ -288,8 +294,8 @@ def compress(
     """Find a file that meets a target; write it, a page, and a record; return the record.
 
     The model is pruned and fine-tuned from one fraction of the Gaussians to the next.  Each rung is written with
-    several SH settings, and every file is read back and measured.  The search stops when fewer Gaussians cannot help.
-    An interrupted search resumes.
+    several SH settings, and every file is read back and measured.  The search stops when further pruning cannot
+    improve the result.  An interrupted search resumes.
     Raises ConfigError for a target that no file meets, after writing the page, and OutputError if another process
     searches in `out`.
     """

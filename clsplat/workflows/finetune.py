@@ -54,7 +54,10 @@ class Tuning:
     device: Device
 
     def pipeline(self, stages: Sequence[str], values: Mapping[str, Any], **export: str) -> Pipeline:
-        """Return a pipeline of these stages of the recipe and an export.  values: settings by key path."""
+        """Return a pipeline of the recipe's stages with these names, followed by an export stage.
+
+        values: settings by key path; export: settings of the export stage.
+        """
         path = find(RECIPE)
         data = read_yaml(path).data
         stage_data = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, "sky": "sidecar", **export}}]
@@ -95,7 +98,7 @@ class Tuning:
 
 
 def train_in_folder(pipeline: Pipeline, folder: Path, device: Device, file: str = MODEL) -> Path:
-    """Run a pipeline in a folder; return the file that it writes.
+    """Run a pipeline in a folder; return the path of `file` in the folder, which the pipeline writes.
 
     A finished run is kept, an interrupted one resumes, and missing files are restored.  If all checkpoints are damaged,
     the run starts over.
@@ -135,7 +138,7 @@ def _select_stages(stages: Iterable[Any], names: Iterable[str]) -> list[Any]:
 
 
 def _shift_start(training: Any, steps: int) -> Any:
-    """Subtract `steps` from the start steps of a training stage's inner stages, counted from the start of the run."""
+    """Subtract `steps` from the start steps of a training stage's inner stages, which count from the run's start."""
     keys = training[TRAINING]
     during = [
         {name: {**inner, **({"start": inner["start"] - steps} if "start" in inner else {})}}
@@ -161,7 +164,7 @@ def claim_folder(out: Path, identity: dict[str, Any], record: str, content: str,
 
     identity: inputs and options of the work, by key; content: a noun for messages, such as "a search"; remedy: the
     alternative to this folder, such as "another --out".
-    Raises ConfigError if the folder belongs to something else, and OutputError if another process uses it.
+    Raises ConfigError if the folder contains other work or other files, and OutputError if another process uses it.
     """
     _require_same_identity(out, identity, record, content, remedy)
     with raising_output_error(out):
@@ -193,7 +196,7 @@ def _require_same_identity(out: Path, identity: dict[str, Any], record: str, con
 
 
 def _is_leftover(name: str) -> bool:
-    """Return whether a file may be left by a process killed before writing its record: a lock or a hidden file."""
+    """Return whether a file may be left over from a process that was killed early: a lock or a hidden file."""
     return name == LOCK or name[0] == "."
 
 

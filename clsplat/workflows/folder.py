@@ -62,7 +62,7 @@ def blocks_status(out: Path) -> dict[str, Any]:
 def verify_blocks(out: Path) -> dict[str, Any]:
     """Verify all runs of a scene in blocks and the files that they share.
 
-    Returns the keys of `clsplat.runs.verify.verify`, and `remedy`.
+    Returns a dictionary with the keys of `clsplat.runs.verify.verify`, and `remedy`.
     """
     state = blocks_status(out)["state"]
     objects = list(_check_files(out, state == "done"))

@@ -110,7 +110,8 @@ Tables = dict[str, Floats]
 def decimate(model: Model, keep: float = 0.5) -> Model:
     """Reduce a model to a fraction of its Gaussians, at least one, by merging neighbors.
 
-    A world filter is baked in.  Raises ConfigError for an invalid fraction, DataError for values that are not finite.
+    The world filter is baked into the result.  Raises ConfigError for an invalid fraction, and DataError for values
+    that are not finite.
     """
     if not 0 < keep <= 1:
         raise ConfigError(f"--keep {keep:g}: expected a fraction of the Gaussians above 0, up to 1")
@@ -145,7 +146,7 @@ def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
 
 
 def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
-    """Return the cost of merging each pair, [pairs].  It is symmetric up to rounding."""
+    """Return the cost of merging each pair, [pairs].  Swapping `first` and `second` changes it only by rounding."""
     mass, log_volume = masses(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows, computed once
     blocks = [slice(start, start + BLOCK) for start in range(0, len(first), BLOCK)]
     return np.concatenate([_block_cost(tables, mass, log_volume, first[block], second[block]) for block in blocks])
@@ -166,7 +167,7 @@ def _block_cost(tables: Tables, mass: Floats, log_volume: Floats, first: Rows, s
 def _neighbors(means: Floats) -> tuple[Rows, Rows]:
     """Return unique pairs of rows that are nearest neighbors, lower row first, in ascending order.
 
-    Rows at the same position form a chain, and only its first row has neighbors at other positions.
+    Rows at the same position are paired as a chain, and only the first row of a chain has neighbors elsewhere.
     """
     positions, first_row, position_index = np.unique(means, axis=0, return_index=True, return_inverse=True)
     count = len(positions)
@@ -209,8 +210,8 @@ def build_levels(
 ) -> dict[str, Any]:
     """Write levels of detail as streamed SOG.  Returns `folder`, its `bytes`, the measured `split`, and `levels`.
 
-    With photos, each coarser level is trained before the next one is merged from it, in run folders in FOLDER.training;
-    interrupted training resumes.  Raises ConfigError, DataError, OutputError.
+    If there are photos, each coarser level is trained before the next one is merged from it.  The run folders are in
+    FOLDER.training, and interrupted training resumes.  Raises ConfigError, DataError, OutputError.
     """
     plan = plan or LodPlan()
     require_free(folder)
@@ -240,7 +241,10 @@ def build_levels(
 
 
 def _open_model(model: Path, scene: Path | None, plan: LodPlan, device: Any) -> tuple[ModelFile | None, Model]:
-    """Return the model file, or None if it has no photos, and its Gaussians with the world filter baked in."""
+    """Return the model file with its photos, and its Gaussians with the world filter baked in.
+
+    If the photos are unknown or cannot be read, the first value is None.
+    """
     run = find_run(model) if scene is None else None
     if scene is None and run is None:
         gaussians = _without_photos(model, plan, device, "its photos are unknown")

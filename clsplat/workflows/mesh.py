@@ -64,7 +64,7 @@ class MeshOptions:
 
 @dataclass(frozen=True)
 class RenderedDepth(DepthImage):
-    """The depths and colors of a view, and where it shows nothing."""
+    """The depths and colors of a view, and a mask of the pixels that show nothing."""
 
     is_empty: NDArray[np.bool_]  # [height, width]
 
@@ -72,7 +72,8 @@ class RenderedDepth(DepthImage):
 def denoise(image: DepthImage, voxel: float) -> NDArray[np.float32]:
     """Return the depths with bilateral smoothing (Tomasi & Manduchi 1998).  voxel: scene units.
 
-    Depths beyond the reach of `find_blocks` do not change: the filter quantizes differences to 1/4096 of their range.
+    Depths beyond the reach of `find_blocks` are left unchanged, because the filter quantizes differences to 1/4096 of
+    their range.
     """
     depth, reach = image.depth, np.float32(MAX_PIXEL * voxel * image.view.camera.fx)
     smooth = cv2.bilateralFilter(np.minimum(depth, reach), WINDOW, SIMILAR * voxel, SIGMA)
@@ -87,21 +88,24 @@ class DepthSource:
     views: Sequence[View]
 
     def images(self, label: str, voxel: float, empty_depth: float = 0.0) -> Iterator[DepthImage]:
-        """Yield the images of all views, denoised.  voxel: scene units; empty_depth: of pixels that show nothing."""
+        """Yield the denoised depth images of all views.
+
+        voxel: scene units; empty_depth: of pixels that show nothing.
+        """
         for view in counted(self.views, label, len(self.views)):
             image = self.render(view)
             depth = denoise(image, voxel)
             yield replace(image, depth=np.where(image.is_empty, np.float32(empty_depth), depth))
 
     def render(self, view: View) -> "RenderedDepth":
-        """Return the median depths, where the model is opaque, and the colors of a view."""
+        """Return the colors of a view, and its median depths, which are 0 where the model is not opaque."""
         layers = self.canvas.render_layers(view, ("median_depth",))
         assert layers.median_depth is not None
         depth = np.where(layers.alpha >= OPAQUE, layers.median_depth, 0)
         return RenderedDepth(view, depth, np.clip(layers.image, 0, 1), layers.alpha < EMPTY)
 
     def pixel_size(self) -> float:
-        """Return the median size of a pixel on the surface in a sample of views, scene units; 0 without a surface."""
+        """Return the median size of a pixel on the surface in a sample of views, scene units; 0 if none shows it."""
         sample = np.unique(np.linspace(0, len(self.views) - 1, min(PROBES, len(self.views))).round().astype(int))
         images = [self.render(self.views[i]) for i in sample]
         depths = [(image.depth[image.depth > 0], image.view.camera.fx) for image in images]
@@ -163,9 +167,9 @@ def _surface(source: DepthSource, blocks: Blocks, voxel: float) -> Mesh:
 
 
 def _hull(source: DepthSource, blocks: Blocks, voxel: float, cell: float | None) -> tuple[Mesh, float]:
-    """Return the closed hull of what fewer than two views see as free, and its cell, scene units.
+    """Return the closed hull of the space that fewer than two views see as free, and the side of a cell, scene units.
 
-    cell: None: CELL voxels, or twice as much until there are at most MAX_CELLS.
+    cell: side of the cells; None: CELL voxels, doubled until there are at most MAX_CELLS.
     """
     step = cell or CELL * voxel
     first, shape = _box(blocks, voxel / step)
@@ -181,16 +185,16 @@ def _hull(source: DepthSource, blocks: Blocks, voxel: float, cell: float | None)
 
 
 def _box(blocks: Blocks, ratio: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first of the blocks of another step that contain these, [3], and their number along each axis, [3].
+    """Return the smallest box of blocks of another step that contains these: its first block and its shape, [3] each.
 
-    ratio: the step of these blocks, divided by the other step.
+    ratio: the step of these blocks divided by the step of the blocks of the box.
     """
     first = np.floor(blocks.min(axis=0) * ratio).astype(np.int64)
     return first, np.ceil((blocks.max(axis=0) + 1) * ratio).astype(np.int64) - first
 
 
 def _require_memory(blocks: int, point_bytes: int, voxel: float) -> None:
-    """Log the memory of blocks.  Raises MemoryLimitError, before allocating, if it exceeds the free memory."""
+    """Log the memory that blocks need.  Raises MemoryLimitError if it exceeds the free memory."""
     size, free = blocks * SIDE**3 * point_bytes, available_memory()
     LOG.info("voxel %.4g scene units, %s blocks of %d³, %.0f MB", voxel, f"{blocks:,}", SIDE, size / 1e6)
     if free is not None and size > free:

@@ -81,7 +81,7 @@ def quantile(values: Floats, weights: Floats, fraction: float) -> float:
 
 
 def _split_box(means: Floats, weights: Floats, box: Box, count: int) -> list[PartitionCell]:
-    """Split a box recursively, with the Gaussians inside it, into `count` cells."""
+    """Split a box and the Gaussians inside it recursively into `count` cells."""
     bounds = np.array(
         [[quantile(means[:, axis], weights, fraction) for axis in range(3)] for fraction in SIZE_QUANTILES]
     )
@@ -133,7 +133,7 @@ class Membership:
 
     @property
     def assignment(self) -> NDArray[np.bool_]:
-        """Whether each view trains each block, [V, B]: pairs in `view_blocks`, and at least one view for each block."""
+        """Whether each view is used to train each block, [V, B]: `view_blocks`, and at least one view per block."""
         blocks = self.view_blocks
         for block in np.flatnonzero(~blocks.any(axis=0)):
             blocks[self.coverage[:, block].argmax(), block] = True
@@ -308,7 +308,7 @@ class Partitioner:
         ]
 
     def _memory(self, gaussians: int, views: Sequence[int]) -> int:
-        """Return the device memory for training, in bytes.  gaussians: initial count; views: indices of views."""
+        """Return the device memory for training, in bytes.  gaussians: initial number; views: indices of views."""
         cameras = [self.views[view].camera for view in views]
         sizes = [4 * camera.width * camera.height for camera in cameras]
         cached_bytes = min(int(BUDGET_FRACTION * self.device.info.memory), sum(sizes))

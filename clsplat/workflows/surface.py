@@ -1,7 +1,7 @@
 """Extract, clean, smooth, and reduce triangle meshes.
 
-Vertices of neighboring blocks are joined by the integer key of their edge of the grid, because rounded coordinates of
-the same vertex may differ.
+Vertices of neighboring blocks are merged if they are on the same edge of the grid, which an integer key identifies.
+Their coordinates are not compared, because they may differ by rounding.
 """
 
 import logging
@@ -30,9 +30,9 @@ MIN_REDUCED = 1000  # faces: smaller meshes are not reduced
 
 
 def _pad_blocks(values: NDArray[Any], neighbors: NDArray[np.intp], fill: float) -> NDArray[Any]:
-    """Return a block with the first layers of its neighbors behind it, [SIDE + 1, SIDE + 1, SIDE + 1, …].
+    """Return a block extended by the first layer of the next block along each axis, [SIDE + 1, SIDE + 1, SIDE + 1, …].
 
-    neighbors: [2, 2, 2] rows of the block itself and of the next blocks in each direction; -1: missing.
+    neighbors: [2, 2, 2] indices of the block itself and of the next blocks in `values`; -1: missing.
     """
     block = np.full((SIDE + 1,) * 3 + values.shape[4:], fill, values.dtype)
     parts = slice(0, SIDE), slice(SIDE, SIDE + 1)
@@ -44,7 +44,7 @@ def _pad_blocks(values: NDArray[Any], neighbors: NDArray[np.intp], fill: float) 
 
 
 def _next_blocks(blocks: NDArray[np.int32]) -> NDArray[np.intp]:
-    """Return the row of each block and of its next blocks in each direction, [B, 2, 2, 2]; -1: missing."""
+    """Return the index of each block and of the next blocks along the axes, [B, 2, 2, 2]; -1: missing."""
     rows = {block: row for row, block in enumerate(map(tuple, blocks.tolist()))}
     offsets = list(np.ndindex(2, 2, 2))
     table = [[rows.get((x + i, y + j, z + k), -1) for i, j, k in offsets] for x, y, z in blocks.tolist()]
@@ -52,7 +52,7 @@ def _next_blocks(blocks: NDArray[np.int32]) -> NDArray[np.intp]:
 
 
 def extract(field: DistanceField) -> Mesh:
-    """Return the surface of a distance field, where all eight corners of a cube are known (Lorensen & Cline 1987)."""
+    """Return the surface of a distance field in the cubes whose eight corners are all known (Lorensen & Cline 1987)."""
     vertices, keys, faces, colors, count = [], [], [], [], 0
     low = field.blocks.min(axis=0).astype(np.int64) * SIDE if len(field.blocks) else np.zeros(3, np.int64)
     for block, row in zip(
@@ -96,7 +96,7 @@ def _march(values: NDArray[np.float32]) -> tuple[Floats, NDArray[np.int64]] | No
 
 
 def _edges(vertices: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the lower grid point of each vertex's edge, [V, 3], and the axis of the edge, [V]; 3: inside a cube."""
+    """Return the lower grid point, [V, 3], and the axis, [V], of each vertex's grid edge.  Axis 3: inside a cube."""
     nearest = np.rint(vertices)
     is_between = np.abs(vertices - nearest) > MIN_FRACTION
     cells = np.where(is_between, np.floor(vertices), nearest).astype(np.int64)
@@ -104,7 +104,10 @@ def _edges(vertices: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _interpolate(colors: NDArray[np.uint8], vertices: Floats) -> NDArray[np.uint8]:
-    """Return the colors of vertices between the known colors of two grid points, [V, 3].  colors: [n, n, n, 4]."""
+    """Interpolate the colors of vertices, [V, 3], between the grid points whose colors are known.
+
+    colors: [n, n, n, 4] red, green, blue, and 1 where they are known.
+    """
     low, high = np.floor(vertices + MIN_FRACTION).astype(int), np.ceil(vertices - MIN_FRACTION).astype(int)
     share = np.clip(vertices - low, 0, 1).max(axis=1, keepdims=True)
     ends = [colors[tuple(corner.T)].astype(np.float64) for corner in (low, high)]
@@ -115,7 +118,7 @@ def _interpolate(colors: NDArray[np.uint8], vertices: Floats) -> NDArray[np.uint
 
 
 def weld(mesh: Mesh, keys: NDArray[np.int64]) -> Mesh:
-    """Join the vertices with equal keys, [V, 4] integers, and remove faces without an area."""
+    """Merge vertices that have equal keys, and remove the faces that become degenerate.  keys: [V, 4]."""
     size = keys.max(axis=0) + 1
     flat = ((keys[:, 0] * size[1] + keys[:, 1]) * size[2] + keys[:, 2]) * 4 + keys[:, 3]
     _, first, index = np.unique(flat, return_index=True, return_inverse=True)
@@ -125,7 +128,7 @@ def weld(mesh: Mesh, keys: NDArray[np.int64]) -> Mesh:
 
 
 def remove_small_parts(mesh: Mesh) -> Mesh:
-    """Remove the connected parts with fewer than MIN_PART of the faces of the largest."""
+    """Remove connected parts that have fewer faces than MIN_PART times those of the largest part."""
     if not len(mesh.faces):
         return mesh
     part = connected_components(_adjacency(mesh), directed=False)[1][mesh.faces[:, 0]]
@@ -134,7 +137,7 @@ def remove_small_parts(mesh: Mesh) -> Mesh:
 
 
 def _adjacency(mesh: Mesh) -> Any:
-    """Return a sparse matrix, [V, V], that is 1 for the two vertices of each edge."""
+    """Return the sparse adjacency matrix of the vertices, [V, V]: 1 for two vertices that share an edge."""
     first, second = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
     ends = np.concatenate([first, second]), np.concatenate([second, first])
     matrix = sparse.csr_matrix((np.ones(len(ends[0])), ends), shape=(len(mesh.vertices),) * 2)
@@ -154,9 +157,10 @@ def smooth(mesh: Mesh) -> Mesh:
 
 
 def reduce(mesh: Mesh, keep: float) -> Mesh:
-    """Reduce a mesh to a fraction of its faces by quadrics (Garland & Heckbert 1997); a closed surface stays closed.
+    """Reduce a mesh to a fraction of its faces with quadric error metrics (Garland & Heckbert 1997).
 
-    Raises ConfigError without the package that does it.
+    A closed surface stays closed, even if more faces must be kept.  Raises ConfigError if the package
+    fast-simplification is not installed.
     """
     if keep >= 1 or len(mesh.faces) < MIN_REDUCED:
         return mesh
@@ -175,7 +179,7 @@ def reduce(mesh: Mesh, keep: float) -> Mesh:
 
 
 def split_edges(mesh: Mesh) -> Mesh:
-    """Separate faces at edges with more than two faces, and at vertices that connect nothing else."""
+    """Duplicate vertices so that faces are connected only across edges that belong to exactly two faces."""
     start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
     corner, next_corner = np.arange(len(start)), np.roll(np.arange(len(start)).reshape(-1, 3), -1, axis=1).ravel()
     is_up = start < end
@@ -191,9 +195,9 @@ def split_edges(mesh: Mesh) -> Mesh:
 
 
 def hull(is_free: NDArray[np.bool_], corner: NDArray[np.int64], cell: float) -> Mesh:
-    """Return the closed surface of everything that is not free, one cell thicker, in a box of free space.
+    """Return the closed surface of the cells that are not free, dilated by one cell.  Space outside the grid is free.
 
-    is_free: [X, Y, Z]; corner: [3] the index of its first grid point; cell: its step, scene units.
+    is_free: [X, Y, Z]; corner: [3] index of the first grid point of `is_free`; cell: side of a cell, scene units.
     """
     solid = np.pad(ndimage.binary_dilation(~is_free), 2).astype(np.float32)
     level = ndimage.gaussian_filter(solid, 0.7, truncate=1.5)  # equal values at the corners of a cube are ambiguous
