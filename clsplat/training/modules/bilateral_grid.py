@@ -272,7 +272,7 @@ def row_length(shape: Sequence[int]) -> int:
 
 
 def grid_bytes(shape: Sequence[int], photographs: int, rows: int) -> int:
-    """Return the device memory of the grids of all photographs, in bytes.
+    """Return the device memory of the grids, their Adam moments, and their gradients, in bytes.
 
     shape: nx, ny, nz; rows: number of pixel rows of the largest view, padded to full tiles.
     """
