@@ -49,7 +49,7 @@ def mix(a: Vector | Array, b: Vector | Array, t: Array | NDArray[np.bool_]) -> A
 
 
 def grain(p: Array) -> Array:
-    """Return the brightness of wood along x, with wavy rings and fine fibers, [R] in [0, 1]."""
+    """Return the brightness of wood with its grain along x, wavy rings, and fine fibers, [R] in [0, 1]."""
     x, y, z = p
     bend = noise(np.array([1.1 * x, 3 * y, 3 * z]), 2)
     fiber = noise(np.array([7 * x, 80 * y, 80 * z]), 2)

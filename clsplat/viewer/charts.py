@@ -115,7 +115,7 @@ def _grid_line(y: float, label: str) -> list[str]:
 
 
 def _to_axes(line: Line, logarithmic: bool) -> Line:
-    """Return a line with only its finite points; on a logarithmic axis, y becomes log10(y)."""
+    """Return a line with only the points that the axes can show; on a logarithmic axis, y becomes log10(y)."""
     points = [(x, y) for x, y in line.points if math.isfinite(x) and math.isfinite(y)]
     return replace(line, points=[(x, math.log10(y)) for x, y in points if y > 0] if logarithmic else points)
 

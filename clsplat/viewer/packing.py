@@ -114,7 +114,10 @@ def _visible_indices(model: Model) -> NDArray[np.intp]:
 
 
 def _draw_order(model: Model, limit: int | None) -> NDArray[np.intp]:
-    """Return the indices of visible Gaussians in LEVELS parts of decreasing importance, each part in Morton order."""
+    """Return the indices of at most `limit` visible Gaussians, in LEVELS parts of decreasing importance.
+
+    Each part is in Morton order.
+    """
     indices = _visible_indices(model)
     means = model.means[indices].astype(np.float64)
     areas = np.sort(model.log_scales[indices].astype(np.float64), axis=1)[:, 1:].sum(axis=1)

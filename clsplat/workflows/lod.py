@@ -89,7 +89,7 @@ class LevelTrainer:
         return DetailLevel(model, psnr, psnr)
 
     def train(self, number: int, model: Model) -> DetailLevel:
-        """Fine-tune a level, unless `steps` is 0, and measure its PSNR before and after."""
+        """Fine-tune a level, unless `steps` is 0, and measure its PSNR before and after training."""
         merged_level = self.measure(model)
         if not self.steps:
             return merged_level

@@ -1,7 +1,7 @@
 """Write the surface of a model as a mesh, or a closed hull for collisions.
 
-Median depths of the training views are fused into a truncated signed distance (clsplat/render/fusion.py), from which
-the surface is extracted, cleaned, and smoothed.
+Median depths of the training views are fused into a truncated signed distance field (clsplat/render/fusion.py), from
+which the surface is extracted, cleaned, and smoothed.
 """
 
 import logging

@@ -278,7 +278,7 @@ class Partitioner:
     def _members(
         self, cell_index: NDArray[np.int64], partition: list[PartitionCell], min_coverage: float
     ) -> tuple[Membership, Mask]:
-        """Return the views of each block, and a mask, [B, N], of the Gaussians visible in these views or in no view."""
+        """Return the views of each block, and a mask, [B, N], of Gaussians visible in its views or in no view."""
         positions = np.stack([view.position for view in self.views])
         is_inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in partition], axis=1)
         coverage, visible_in_block = np.zeros(is_inside.shape), np.zeros((len(partition), len(cell_index)), bool)

@@ -54,7 +54,10 @@ def parse_times(value: "str | float | Sequence[float] | None") -> Times | None:
 
 
 def with_times(views: Sequence[View], times: Times) -> list[View]:
-    """Return views with evenly spaced timestamps from the first to the last time.  A single view gets the first."""
+    """Return views with evenly spaced timestamps from the first to the last time.
+
+    A single view gets the first time.
+    """
     return [replace(view, time=float(time)) for view, time in zip(views, np.linspace(*times, len(views)), strict=True)]
 
 
