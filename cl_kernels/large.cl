@@ -120,9 +120,9 @@ void emit_large(
     __global const uint *restrict tile_box,    // [S] see tiles.h
     __global const uint *restrict tile_count,  // [S]
     __global const uint *restrict first_pair,  // [N] first pair of each Gaussian
-    __global const uint *restrict pair_count,  // [1] 0 if the pairs exceed the room
-    __global uint *restrict pair_tile,         // [room]
-    __global uint *restrict pair_splat,        // [room]
+    __global const uint *restrict pair_count,  // [1] 0 if the pairs exceed the capacity
+    __global uint *restrict pair_tile,         // [capacity]
+    __global uint *restrict pair_splat,        // [capacity]
     const uint tiles_x,
     const uint row_begin,                      // of the band of tiles
     const uint row_end,

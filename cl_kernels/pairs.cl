@@ -4,26 +4,26 @@
  * pair has one writer. */
 #include "tiles.h"
 
-/* The pairs of splats with a mask; large.cl adds those of large splats.  If there are more pairs than `room`, none are
- * listed.  One item = one position in `order`, and at least one item. */
+/* The pairs of splats with a mask; large.cl adds those of large splats.  If there are more pairs than `capacity`, none
+ * are listed.  One item = one position in `order`, and at least one item. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void emit_pairs(
     __global const uint *restrict tile_box,     // [S] see tiles.h
     __global const uint *restrict tile_mask,    // [S] see tiles.h
     __global const uint *restrict order,        // [N] Gaussian at each position
     __global const uint *restrict pair_offset,  // [N+1] first pair of each position
-    __global uint *restrict pair_tile,          // [room]
-    __global uint *restrict pair_splat,         // [room]
+    __global uint *restrict pair_tile,          // [capacity]
+    __global uint *restrict pair_splat,         // [capacity]
     __global uint *restrict first_pair,         // [N] first pair of each Gaussian
     __global uint *restrict pair_count,         // [1] listed pairs
     const uint tiles_x,
-    const uint room,
+    const uint capacity,
     const uint count)
 {
     const uint position = get_global_id(0), pairs = pair_offset[count];
     if (position == 0)
-        pair_count[0] = pairs <= room ? pairs : 0;
-    if (position >= count || pairs > room)
+        pair_count[0] = pairs <= capacity ? pairs : 0;
+    if (position >= count || pairs > capacity)
         return;
     const uint i = order[position];
     uint pair = pair_offset[position];
@@ -49,7 +49,7 @@ void emit_pairs(
 /* The first pair of each tile in the list sorted by tile.  One item = one slot for a pair, and one more. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void find_tile_offsets(
-    __global const uint *restrict sorted_tile,  // [room] ascending
+    __global const uint *restrict sorted_tile,  // [capacity] ascending
     __global const uint *restrict pair_count,   // [1]
     __global uint *restrict tile_offset,        // [T+1]
     const uint tiles)

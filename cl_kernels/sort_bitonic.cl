@@ -11,7 +11,7 @@
 /* tile_count[tile] = pairs of the tile.  One item = one slot for a pair. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void count_pairs(
-    __global const uint *restrict pair_tile,   // [room]
+    __global const uint *restrict pair_tile,   // [capacity]
     __global const uint *restrict pair_count,  // [1]
     __global uint *restrict tile_pair_count)   // [T] starts at 0
 {
@@ -23,14 +23,14 @@ void count_pairs(
 /* Write each pair, with its depth, to its tile.  One item = one slot for a pair. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void fill_tiles(
-    __global const uint *restrict pair_tile,   // [room]
-    __global const uint *restrict pair_splat,  // [room]
+    __global const uint *restrict pair_tile,   // [capacity]
+    __global const uint *restrict pair_splat,  // [capacity]
     __global const uint *restrict pair_count,  // [1]
     __global const uint *restrict depth_key,   // [N] bits of z
     __global const uint *restrict tile_offset, // [T+1]
     __global uint *restrict tile_fill,         // [T] starts at 0
-    __global uint *restrict tile_depth,        // [room]
-    __global uint *restrict tile_pairs)        // [room]
+    __global uint *restrict tile_depth,        // [capacity]
+    __global uint *restrict tile_pairs)        // [capacity]
 {
     const uint pair = get_global_id(0), count = pair_count[0];
     if (pair >= count)

@@ -3,7 +3,7 @@
  * A block is one work-group; each of its TEAM items owns a run of consecutive pairs, so that the order in a block is
  * the order of items, and stability needs no atomics.  On CPUs one item per group sorts a long run with wide digits; on
  * GPUs the items of a group sort short runs with narrow digits.  The number of keys may be known only on the device:
- * `key_count`, at most `room`, for which the host chooses the number of blocks.
+ * `key_count`, at most `capacity`, for which the host chooses the number of blocks.
  * Local memory: 4 << DIGIT_BITS bytes * TEAM.  Deterministic. */
 #include "common.h"
 
@@ -27,16 +27,16 @@ static inline uint run_length(const uint count)
 /* digit_count[digit][block] = keys of the block with that digit. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void radix_count(
-    __global const uint *restrict keys,       // [room]
+    __global const uint *restrict keys,       // [capacity]
     __global const uint *restrict key_count,  // [1]
     __global uint *restrict digit_count,      // [digits,blocks]
     const uint shift,
     const uint digits,
-    const uint room)
+    const uint capacity)
 {
     __local uint counts[TEAM << DIGIT_BITS];
     const uint item = get_local_id(0), block = get_group_id(0), blocks = get_num_groups(0);
-    const uint count = min(key_count[0], room), run = run_length(count);
+    const uint count = min(key_count[0], capacity), run = run_length(count);
     count_digits(keys, counts, (block * TEAM + item) * run, run, shift, digits, count);
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint digit = item; digit < digits; digit += TEAM) {
@@ -50,20 +50,20 @@ void radix_count(
 /* Move every pair to its position.  In the first pass the values are the indices of the keys: 0, 1, 2, ... */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void radix_scatter(
-    __global const uint *restrict keys,          // [room]
-    __global const uint *restrict values,        // [room], not read in the first pass
+    __global const uint *restrict keys,          // [capacity]
+    __global const uint *restrict values,        // [capacity], not read in the first pass
     __global const uint *restrict key_count,     // [1]
     __global const uint *restrict digit_offset,  // [digits*blocks+1] scanned digit_count
-    __global uint *restrict sorted_keys,         // [room]
-    __global uint *restrict sorted_values,       // [room]
+    __global uint *restrict sorted_keys,         // [capacity]
+    __global uint *restrict sorted_values,       // [capacity]
     const uint first_pass,
     const uint shift,
     const uint digits,
-    const uint room)
+    const uint capacity)
 {
     __local uint positions[TEAM << DIGIT_BITS];
     const uint item = get_local_id(0), block = get_group_id(0), blocks = get_num_groups(0);
-    const uint count = min(key_count[0], room), run = run_length(count);
+    const uint count = min(key_count[0], capacity), run = run_length(count);
     const uint first = (block * TEAM + item) * run;
     if (TEAM > 1)  // a single item starts at the start of its block
         count_digits(keys, positions, first, run, shift, digits, count);

@@ -13,7 +13,7 @@ import numpy as np
 
 from clsplat.runs.results import read_settings
 from clsplat.training.records import Records
-from clsplat.viewer.charts import HEIGHT, WIDTH, Line, curve
+from clsplat.viewer.charts import HEIGHT, WIDTH, Line, line_chart
 
 MAX_SECONDS = 130  # CPU seconds to show
 STYLE = "<style>text{font:11px sans-serif;fill:#4a5568}.grid{stroke:#e2e8f0}</style>"
@@ -45,7 +45,7 @@ if __name__ == "__main__":
     scenes = (argument.partition("=") for argument in sys.argv[1:])
     print(
         draw_charts([
-            curve(f"{name}: test PSNR over CPU seconds, dB", [psnr_curve(Path(run)) for run in runs.split(",")])
+            line_chart(f"{name}: test PSNR over CPU seconds, dB", [psnr_curve(Path(run)) for run in runs.split(",")])
             for name, _, runs in scenes
         ]),
         end="",

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from clsplat.conformance.check import Deviation
 from clsplat.conformance.checks import KERNELS, SPEED
-from clsplat.conformance.host import system
+from clsplat.conformance.host import describe_host
 from clsplat.conformance.quick import forget, remember
 from clsplat.conformance.supervision import CheckResult, run_checks
 from clsplat.core.errors import pluralize
@@ -130,7 +130,7 @@ class DeviceReport:
             "schema": SCHEMA,
             "verdict": {"usable": verdict.usable, "text": verdict.text, "advice": verdict.advice},
             "device": {**asdict(self.info), "schedule": self.default},
-            "host": system(),
+            "host": describe_host(),
             "schedules": {name: [_to_plain(result) for result in results] for name, results in self.schedules.items()},
             "once": [_to_plain(result) for result in self.once],
             "seconds": round(self.seconds, 1),
@@ -291,7 +291,7 @@ def report_page(report: DeviceReport) -> str:
 
 
 def _facts(report: DeviceReport) -> dict[str, str]:
-    info, host = report.info, system()
+    info, host = report.info, describe_host()
     training = report.note("training")
     facts = {
         "device": f"{info.name}, {info.kind}, {info.units} compute units",

@@ -16,7 +16,7 @@ CACHES = ("POCL_CACHE", "CUDA_CACHE")  # do not change kernels
 PREFIXES = (*CODE, "CLSPLAT_", "OCL_", "PYOPENCL_NO", "PYOPENCL_CTX", "OCLGRIND_")
 
 
-def system() -> dict[str, Any]:
+def describe_host() -> dict[str, Any]:
     """Describe the host for a bug report, with only the environment variables of OpenCL runtimes."""
     return {
         "clsplat": full_version(),

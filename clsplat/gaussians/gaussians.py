@@ -27,7 +27,7 @@ from clsplat.opencl.device import Array, Device
 # Detection of NaN and infinity.
 
 
-def nonfinite_tables(gaussians: Struct) -> list[str]:
+def find_nonfinite(gaussians: Struct) -> list[str]:
     """Return the names of parameters that contain NaN or infinity, in their values or in their Adam moments."""
     device, names = gaussians.device, set()
     counters = {name: device.zeros(1, np.uint32) for name in gaussians.trained}
@@ -232,9 +232,9 @@ class Gaussians:
         """The names of the tables that are zero in new rows."""
         return [name for name, table in self.tables.items() if table.zero_fresh]
 
-    def nonfinite_tables(self) -> list[str]:
+    def find_nonfinite(self) -> list[str]:
         """Return the names of parameters that contain NaN or infinity, in their values or in their Adam moments."""
-        return nonfinite_tables(self)
+        return find_nonfinite(self)
 
     def rearrange(self, source: Array, fresh: Array, count: int) -> None:
         """Replace row i of every table with its row source[i]; set moments and statistics of fresh rows to zero.

@@ -70,14 +70,18 @@ def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Para
 
     Raises DataError if their motions have different columns.
     """
-    widths = {table[MOTION].shape[1]: name for table, name in zip(tables, names, strict=True) if MOTION in table}
-    if len(widths) > 1:
-        first, second, *_ = widths.values()
+    names_by_width = {
+        table[MOTION].shape[1]: name for table, name in zip(tables, names, strict=True) if MOTION in table
+    }
+    if len(names_by_width) > 1:
+        first, second, *_ = names_by_width.values()
         raise DataError(
             f"{second}: its motion differs from {first} in degree or rotation; merge them at one "
             "time (`clsplat convert MODEL OUT --time T`)"
         )
     return [
-        {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *widths))} if widths else table
+        {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *names_by_width))}
+        if names_by_width
+        else table
         for table in tables
     ]

@@ -107,7 +107,7 @@ class ImageLoss(Loss):
     reads_photograph: ClassVar[bool] = True
     """Whether the loss compares the image with the photo; training needs at least one such loss."""
 
-    def reads(self, step: int) -> Content:
+    def required_content(self, step: int) -> Content:
         """Return the planes of the image that the loss needs at a global step: colors, or colors and inverse depth."""
         return "color"
 
@@ -167,5 +167,5 @@ def required_content(losses: Sequence[Loss], step: int) -> Content:
     for loss in losses:
         if not isinstance(loss, ImageLoss | Penalty):
             raise ConfigError(f"the loss {type(loss).__name__}: expected a subclass of ImageLoss or of Penalty")
-    has_depth = any(loss.reads(step) == "inverse_depth" for loss in losses if isinstance(loss, ImageLoss))
+    has_depth = any(loss.required_content(step) == "inverse_depth" for loss in losses if isinstance(loss, ImageLoss))
     return "inverse_depth" if has_depth else "color"

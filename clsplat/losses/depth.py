@@ -27,7 +27,7 @@ class InverseDepth(ImageLoss):
     map is fitted to the points of its photo, and used instead of them.  Default: only points."""
     reads_photograph: ClassVar[bool] = False
 
-    def reads(self, step: int) -> Content:
+    def required_content(self, step: int) -> Content:
         return "inverse_depth" if at_step(self.weight, step) > 0 else "color"
 
     def add(self, comparison: Comparison) -> LossValue:

@@ -75,8 +75,8 @@ class PruneRedundant(Rule):
         views = survey.sample_views(self.views)
         limit = (1 + edit.at(self.error_rise)) * squared_error(survey, views)
 
-        def is_allowed(number: int) -> bool:
-            return evaluate_without(gaussians, order[:number], lambda: squared_error(survey, views)) <= limit
+        def is_allowed(count: int) -> bool:
+            return evaluate_without(gaussians, order[:count], lambda: squared_error(survey, views)) <= limit
 
         is_pruned = np.zeros(len(order), bool)
         is_pruned[order[: find_largest_allowed(is_allowed, len(order))]] = True

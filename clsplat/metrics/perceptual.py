@@ -130,16 +130,16 @@ class Perceptual:
             values["lpips"] = self.lpips.distance(image, photograph)
         return values
 
-    def mean(self, views: Sequence[dict[str, float | None]]) -> dict[str, Any]:
+    def mean(self, view_metrics: Sequence[dict[str, float | None]]) -> dict[str, Any]:
         """Return the means over views, with the keys of metrics.json, and the reasons why values are missing."""
-        averages: dict[str, Any] = {name: _mean(views, name) for name in self.names}
+        averages: dict[str, Any] = {name: _mean(view_metrics, name) for name in self.names}
         if "ms_ssim" in self.names:
-            averages["ms_ssim_scales"] = min(int(view["ms_ssim_scales"] or 0) for view in views)
+            averages["ms_ssim_scales"] = min(int(metrics["ms_ssim_scales"] or 0) for metrics in view_metrics)
             if averages["ms_ssim"] is None:
                 averages["ms_ssim_reason"] = f"images are smaller than the window of {2 * RADIUS + 1} px"
         if self.lpips is None:
             return {**averages, "lpips": None, "lpips_reason": "no ONNX file given"}
-        return {**averages, "lpips": _mean(views, "lpips"), **self.lpips.origin()}
+        return {**averages, "lpips": _mean(view_metrics, "lpips"), **self.lpips.origin()}
 
 
 def metric_names(names: Sequence[str]) -> list[Metric]:
@@ -149,8 +149,8 @@ def metric_names(names: Sequence[str]) -> list[Metric]:
     return [name for name in METRICS if name in names]
 
 
-def _mean(views: Sequence[dict[str, float | None]], name: str) -> float | None:
-    values = [value for view in views if (value := view[name]) is not None]
+def _mean(view_metrics: Sequence[dict[str, float | None]], name: str) -> float | None:
+    values = [value for metrics in view_metrics if (value := metrics[name]) is not None]
     return float(np.mean(values)) if values else None
 
 

@@ -110,7 +110,7 @@ class LearnedField(TrainedField):
         """Copy the tables of the field to the host, each [P, 1]."""
         return {name: array.get()[:, None] for name, array in self._arrays.items()}
 
-    def nonfinite_tables(self) -> list[str]:
+    def find_nonfinite(self) -> list[str]:
         """Return the names of the tables that contain NaN or infinity."""
         device, count = self._gradient.device, self.field.shape.parameters
         counters = {name: device.zeros(1, np.uint32) for name in self._arrays}
@@ -137,16 +137,16 @@ class LearnedField(TrainedField):
         self.updates += 1
         self.update(self._gradient, adam, self.updates)
 
-    def update(self, gradient: Array, adam: AdamStep, number: int) -> None:
-        """Update the parameters with Adam and a gradient, [P].  number: index of the update, from 1."""
+    def update(self, gradient: Array, adam: AdamStep, update_number: int) -> None:
+        """Update the parameters with Adam and a gradient, [P].  update_number: from 1."""
         self._program.dense_update(
             items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
             parameters=self.field.parameters,
             moment1=self._arrays["moment1"],
             moment2=self._arrays["moment2"],
             gradient=gradient,
-            rate=adam.rate / (1 - self._beta1**number),
-            correction2=1 / (1 - self._beta2**number),
+            rate=adam.rate / (1 - self._beta1**update_number),
+            correction2=1 / (1 - self._beta2**update_number),
             epsilon=adam.epsilon,
             count=self.field.shape.parameters,
         )

@@ -141,20 +141,20 @@ class PointDepths:
 
         Raises DataError if a depth map cannot be read.
         """
-        if camera.view is None:
+        if camera.view_index is None:
             return None
-        key = camera.view, camera.width, camera.height
+        key = camera.view_index, camera.width, camera.height
         if key not in self._cache:
-            self._cache[key] = self._upload(camera, self._rows[camera.view])
+            self._cache[key] = self._upload(camera, self._rows[camera.view_index])
         return self._cache[key]
 
     def _upload(self, camera: DeviceCamera, rows: NDArray[np.int64]) -> KnownDepths | None:
         indices, depths, order = nearest_in_pixels(camera, self.tracks.positions[rows])
         inverse: NDArray[np.floating] = 1 / depths
         weights = np.minimum(1.0, self._counts[rows[order]] / FULL_WEIGHT_VIEWS)
-        if self.maps and camera.view is not None:
+        if self.maps and camera.view_index is not None:
             pixels = indices // camera.stride, indices % camera.stride
-            samples = self.maps.sample(self.names[camera.view], (camera.width, camera.height), *pixels, inverse)
+            samples = self.maps.sample(self.names[camera.view_index], (camera.width, camera.height), *pixels, inverse)
             if samples is None:
                 return None
             indices, inverse, weights = samples[0] * camera.stride + samples[1], samples[2], np.ones(len(samples[2]))
@@ -180,9 +180,9 @@ def nearest_in_pixels(
     column = np.floor(float(values["fx"]) * x / depth + float(values["cx"]))
     row = np.floor(float(values["fy"]) * y / depth + float(values["cy"]))
     is_inside = in_front & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    rows = np.flatnonzero(is_inside)
-    indices = (row[rows] * camera.stride + column[rows]).astype(np.intp)
-    order = np.lexsort((rows, depth[rows], indices))
+    visible = np.flatnonzero(is_inside)
+    indices = (row[visible] * camera.stride + column[visible]).astype(np.intp)
+    order = np.lexsort((visible, depth[visible], indices))
     _, first = np.unique(indices[order], return_index=True)
     nearest = order[first]
-    return indices[nearest], depth[rows[nearest]], rows[nearest]
+    return indices[nearest], depth[visible[nearest]], visible[nearest]

@@ -149,7 +149,7 @@ class Photographs:
                 f"{original.mask_path or original.image_path}: the mask excludes every pixel of '{original.name}'; "
                 "fix the mask, or remove the photo from the dataset"
             )
-        return replace(photograph, camera=replace(photograph.camera, view=index))
+        return replace(photograph, camera=replace(photograph.camera, view_index=index))
 
     def prefetch(self, views: Iterable[View]) -> None:
         """Start to read the photographs of views that will be used next."""

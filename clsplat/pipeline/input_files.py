@@ -28,7 +28,7 @@ def with_content_hashes(pipeline: Pipeline) -> dict[str, Any]:
     The folder of the scene is omitted, because a scene is identified by its content.  Raises DataError for unreadable
     files.
     """
-    return _map_paths(pipeline, lambda text, path: hash_content(path) or text, None).resolved()
+    return _map_paths(pipeline, lambda text, path: hash_content(path) or text, None).resolved_settings()
 
 
 def with_absolute_paths(pipeline: Pipeline) -> Pipeline:

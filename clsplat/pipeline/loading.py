@@ -76,7 +76,7 @@ class Pipeline:
             )
         return plan(settings.prepare, settings.scene.folder, folder) if settings.prepare else []
 
-    def resolved(self) -> dict[str, Any]:
+    def resolved_settings(self) -> dict[str, Any]:
         """Return all settings with their values, as plain data with the structure of a pipeline file."""
         data = self.settings.model_dump(mode="json")
         data |= {key: [_untag_stage(stage) for stage in data[key]] for key in STAGE_LISTS}
@@ -84,7 +84,7 @@ class Pipeline:
 
     def text(self) -> str:
         """Return the resolved pipeline as YAML."""
-        return yaml_text(self.resolved())
+        return yaml_text(self.resolved_settings())
 
 
 def prepared_folder(out: Path) -> Path:

@@ -58,7 +58,7 @@ def load_file(path: Path) -> Plugin:
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ConfigError(f"--plugin {path}: expected a Python file with the suffix .py")
-    with _importing(name, path) as kinds:
+    with _collect_classes(name, path) as kinds:
         module = sys.modules[name] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     digest = hash_plugin_files(path, *_imported_files(module, path.parent))
@@ -131,7 +131,7 @@ def hash_plugin_files(*modules: Path) -> str:
 
 
 def _load_entry(entry: EntryPoint) -> Plugin:
-    with _importing(entry.module) as kinds:
+    with _collect_classes(entry.module) as kinds:
         module = importlib.import_module(entry.module)
         package = _root_package(module)
         path = Path(module.__file__ or entry.module)
@@ -143,7 +143,7 @@ def _load_entry(entry: EntryPoint) -> Plugin:
 
 
 @contextmanager
-def _importing(module: str, path: Path | None = None) -> Iterator[list[type]]:
+def _collect_classes(module: str, path: Path | None = None) -> Iterator[list[type]]:
     """Yield a list.  When the block ends, add the classes that it defined to the list.
 
     If the block fails or two classes have the same name, remove everything that the block defined, and raise

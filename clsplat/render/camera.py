@@ -37,7 +37,7 @@ class DeviceCamera:
     tiles_x: int
     tiles_y: int
     tile: int
-    view: int | None = None  # index in the table HIDDEN; None renders all Gaussians
+    view_index: int | None = None  # in the table HIDDEN; None renders all Gaussians
     time: float | None = None  # of the scene, in [0, 1], at which moving Gaussians are rendered
     source: View | None = field(default=None, repr=False, compare=False)  # whose values it has
     values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host

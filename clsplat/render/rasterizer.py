@@ -149,7 +149,7 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
     if on_host or (deferred and deferred.updates):
         empty_band = Band(camera.tiles_x, camera.tiles_y, 0, 0)
         mask = workspace.array("left_out", model.gaussians.capacity)
-        visibility = visibility_arguments(model, camera.view, mask)
+        visibility = visibility_arguments(model, camera.view_index, mask)
         depth_key = project(workspace, replace(model, degree=0), camera, empty_band, visibility).footprints.depth_key
         if on_host:
             on_host.upload_visible(depth_key)
@@ -279,7 +279,7 @@ class Rasterizer:
 
     def _halve_bands(self, camera: DeviceCamera) -> bool:
         """Halve the height of the bands; return whether any had more than one row of tiles."""
-        self.tiler.reset_room()
+        self.tiler.reset_capacity()
         bands = self._bands.get(camera.tiles_y, 1)
         self._bands[camera.tiles_y] = 2 * bands
         return bands < camera.tiles_y
@@ -345,7 +345,7 @@ class Rasterizer:
         """Project the splats, and list those of each tile."""
         gaussians, rows = model.gaussians, band.row_end - band.row_begin
         mask = self.workspace.array("left_out", gaussians.capacity)
-        visibility = visibility_arguments(model, camera.view, mask)
+        visibility = visibility_arguments(model, camera.view_index, mask)
 
         def launch() -> ProjectedSplats:
             projection = project(self.workspace, model, camera, band, visibility)

@@ -37,17 +37,17 @@ class Footprints:
 class TileLists:
     """Pairs in emission order, contiguous for each Gaussian, and the depth order of each tile.
 
-    The lists are empty if there are more pairs than `room`; see `Tiler.has_room`.
+    The lists are empty if there are more pairs than `capacity`; see `Tiler.has_room`.
     """
 
     read_pairs: Callable[[], int]  # returns the number of pairs; waits for the device
-    room: int  # pairs that fit
-    limit: int  # largest `room`
-    pair_splat: Array  # [room] Gaussian of each pair
+    capacity: int  # pairs that fit
+    limit: int  # largest `capacity`
+    pair_splat: Array  # [capacity] Gaussian of each pair
     first_pair: Array  # [N] first pair of each Gaussian
     tile_count: Array  # [S] pairs of each Gaussian
     tile_offset: Array  # [T+1]
-    tile_pairs: Array  # [room] pairs ordered by tile, front to back
+    tile_pairs: Array  # [capacity] pairs ordered by tile, front to back
 
     @property
     def key(self) -> tuple[int, ...]:
@@ -105,13 +105,13 @@ class Tiler:
         self._radix = device.program("sort_radix.cl")
         self._digit_bits = int(device.tuning["DIGIT_BITS"])
         self._zero = device.zeros(1, np.uint32)
-        self._room = 0  # pairs for which kernels are launched
-        self._max_key_count = device.upload(np.array([2**32 - 1], np.uint32))  # more keys than any room
+        self._capacity = 0  # pairs for which kernels are launched
+        self._max_key_count = device.upload(np.array([2**32 - 1], np.uint32))  # more keys than any capacity
 
     def build(
         self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines = None
     ) -> TileLists:
-        """Build the tile lists of `count` splats in a band.  Waits only if there is no room for pairs yet.
+        """Build the tile lists of `count` splats in a band.  Waits only if there is no memory for pairs yet.
 
         The lists are valid if `has_room` is true.  limit: maximum number of pairs.  Raises TooManyPairs
         like `has_room`.
@@ -123,11 +123,11 @@ class Tiler:
         key = self.sort, band, count, *(defines or {}).items(), *serials
         order, pair_offset = plans.run(("order", key), {}, self._order, *inputs)
         read_pairs = pair_offset.get_item_later(count)
-        if not self._room:
-            self._make_room(read_pairs(), limit)
-        room = min(self._room, limit)
-        lists = plans.run(("lists", key, room), {}, self._list_pairs, room, order, pair_offset, *inputs)
-        return TileLists(read_pairs, room, limit, *lists)
+        if not self._capacity:
+            self._grow(read_pairs(), limit)
+        capacity = min(self._capacity, limit)
+        lists = plans.run(("lists", key, capacity), {}, self._list_pairs, capacity, order, pair_offset, *inputs)
+        return TileLists(read_pairs, capacity, limit, *lists)
 
     def _order(
         self, splats: Array, footprints: Footprints, band: Band, count: int, defines: Defines
@@ -142,7 +142,7 @@ class Tiler:
 
     def _list_pairs(
         self,
-        room: int,
+        capacity: int,
         order: Array,
         pair_offset: Array,
         splats: Array,
@@ -151,8 +151,8 @@ class Tiler:
         count: int,
         defines: Defines,
     ) -> tuple[Array, ...]:
-        """List up to `room` pairs; return the arrays of TileLists."""
-        pair_tile, pair_splat = self._pair_array("pair_tile", room), self._pair_array("pair_splat", room)
+        """List up to `capacity` pairs; return the arrays of TileLists."""
+        pair_tile, pair_splat = self._pair_array("pair_tile", capacity), self._pair_array("pair_splat", capacity)
         first_pair = self.workspace.array("first_pair", count, np.uint32)
         pair_count = self.workspace.array("pair_count", 1, np.uint32)
         self._pairs.emit_pairs(
@@ -166,7 +166,7 @@ class Tiler:
             first_pair=first_pair,
             pair_count=pair_count,
             tiles_x=band.tiles_x,
-            room=room,
+            capacity=capacity,
             count=count,
         )
         self.device.program("large.cl", **(defines or {})).emit_large(
@@ -177,34 +177,34 @@ class Tiler:
             pair_splat=pair_splat,
         )
         if self.sort == "radix":
-            tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pair_count, room, band.tiles)
+            tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pair_count, capacity, band.tiles)
         else:
             tile_offset, tile_pairs = self._sort_in_tiles(
-                pair_tile, pair_splat, footprints.depth_key, pair_count, room, band.tiles
+                pair_tile, pair_splat, footprints.depth_key, pair_count, capacity, band.tiles
             )
         return pair_splat, first_pair, footprints.tile_count, tile_offset, tile_pairs
 
     def has_room(self, lists: TileLists) -> bool:
-        """Wait for the number of pairs, and return whether they fit; if not, make room, so that `build` succeeds.
+        """Wait for the number of pairs, and return whether they fit; if not, raise the capacity for the next `build`.
 
         Raises TooManyPairs if there are more than the limit.
         """
-        if lists.pairs <= lists.room:
+        if lists.pairs <= lists.capacity:
             return True
-        self._make_room(lists.pairs, lists.limit)
+        self._grow(lists.pairs, lists.limit)
         return False
 
-    def _make_room(self, pairs: int, limit: int) -> None:
+    def _grow(self, pairs: int, limit: int) -> None:
         if pairs > limit:
             raise TooManyPairs
-        self._room = min(int(pairs * GROWTH), limit) if self._room else pairs
+        self._capacity = min(int(pairs * GROWTH), limit) if self._capacity else pairs
 
-    def reset_room(self) -> None:
-        """Forget the room for pairs, so that the next lists get exactly the room that they need."""
-        self._room = 0
+    def reset_capacity(self) -> None:
+        """Forget the capacity for pairs, so that the next lists get exactly the memory that they need."""
+        self._capacity = 0
 
-    def _pair_array(self, name: str, room: int) -> Array:
-        return self.workspace.array(name, room, np.uint32, slack=1.0)
+    def _pair_array(self, name: str, capacity: int) -> Array:
+        return self.workspace.array(name, capacity, np.uint32, slack=1.0)
 
     def _large_arguments(self, splats: Array, footprints: Footprints, band: Band, count: int) -> dict[str, Any]:
         """Return the arguments of both kernels for large splats.  On GPUs, each work-item checks one splat."""
@@ -232,25 +232,30 @@ class Tiler:
         return offset
 
     def sort_pairs(
-        self, keys: Array, bits: int, room: int, name: str, key_count: Array | None = None
+        self, keys: Array, bits: int, capacity: int, name: str, key_count: Array | None = None
     ) -> tuple[Array, Array]:
-        """Sort keys below 2^bits stably; return the sorted keys and their original indices, both [room].
+        """Sort keys below 2^bits stably; return the sorted keys and their original indices, both [capacity].
 
-        key_count: [1] number of keys, by default `room`.
+        key_count: [1] number of keys, by default `capacity`.
         """
         passes = -(-bits // self._digit_bits)
         width = -(-bits // passes)
-        _, blocks = self._runs(room, min_run=1 << 10)
+        _, blocks = self._runs(capacity, min_run=1 << 10)
         values = keys  # the first pass does not read them
         for number in range(passes):
             digits = 1 << min(width, bits - number * width)
-            arguments: dict[str, Any] = {"groups": blocks, "shift": number * width, "digits": digits, "room": room}
+            arguments: dict[str, Any] = {
+                "groups": blocks,
+                "shift": number * width,
+                "digits": digits,
+                "capacity": capacity,
+            }
             arguments |= {"keys": keys, "key_count": key_count or self._max_key_count}
             digit_count = self.workspace.array("digit_count", digits * blocks, np.uint32)
             self._radix.radix_count(digit_count=digit_count, **arguments)
             digit_offset = self.scan(digit_count, digits * blocks, "digit_offset")
             sorted_keys, sorted_values = (
-                self.workspace.array(f"{name}_{part}{number % 2}", room, np.uint32, 1.0 if key_count else GROWTH)
+                self.workspace.array(f"{name}_{part}{number % 2}", capacity, np.uint32, 1.0 if key_count else GROWTH)
                 for part in ("keys", "values")
             )
             self._radix.radix_scatter(
@@ -280,27 +285,27 @@ class Tiler:
             self.workspace.array("index_order", length, np.uint32).set(np.arange(length, dtype=np.uint32))
         return self.workspace.array("index_order", count, np.uint32)
 
-    def _sort_by_tile(self, pair_tile: Array, pair_count: Array, room: int, tiles: int) -> tuple[Array, Array]:
+    def _sort_by_tile(self, pair_tile: Array, pair_count: Array, capacity: int, tiles: int) -> tuple[Array, Array]:
         bits = max(1, (tiles - 1).bit_length())
-        sorted_tile, tile_pairs = self.sort_pairs(pair_tile, bits, room, "tile", pair_count)
+        sorted_tile, tile_pairs = self.sort_pairs(pair_tile, bits, capacity, "tile", pair_count)
         tile_offset = self.workspace.array("tile_offset", tiles + 1, np.uint32)
         self._pairs.find_tile_offsets(
-            items=room + 1, sorted_tile=sorted_tile, pair_count=pair_count, tile_offset=tile_offset, tiles=tiles
+            items=capacity + 1, sorted_tile=sorted_tile, pair_count=pair_count, tile_offset=tile_offset, tiles=tiles
         )
         return tile_offset, tile_pairs
 
     def _sort_in_tiles(
-        self, pair_tile: Array, pair_splat: Array, depth_key: Array, pair_count: Array, room: int, tiles: int
+        self, pair_tile: Array, pair_splat: Array, depth_key: Array, pair_count: Array, capacity: int, tiles: int
     ) -> tuple[Array, Array]:
         tile_fill = self.workspace.array("tile_fill", tiles, np.uint32)
         tile_fill.fill(0)
         bitonic = self.device.program("sort_bitonic.cl")
-        bitonic.count_pairs(items=room, pair_tile=pair_tile, pair_count=pair_count, tile_pair_count=tile_fill)
+        bitonic.count_pairs(items=capacity, pair_tile=pair_tile, pair_count=pair_count, tile_pair_count=tile_fill)
         tile_offset = self.scan(tile_fill, tiles, "tile_offset")
         tile_fill.fill(0)
-        tile_depth, tile_pairs = self._pair_array("tile_depth", room), self._pair_array("tile_pairs", room)
+        tile_depth, tile_pairs = self._pair_array("tile_depth", capacity), self._pair_array("tile_pairs", capacity)
         bitonic.fill_tiles(
-            items=room,
+            items=capacity,
             pair_tile=pair_tile,
             pair_splat=pair_splat,
             pair_count=pair_count,

@@ -235,7 +235,7 @@ def make_run(pipeline: Pipeline, run_scene: RunScene, device: Device, out: Path,
         name=settings.name,
         seed=settings.seed,
         settings=settings,
-        pipeline=pipeline.resolved(),
+        pipeline=pipeline.resolved_settings(),
         rasterizer=Rasterizer(device, settings.rasterizer.sort, settings.rasterizer.limits()),
         harmonics=settings.harmonics,
         photographs=Photographs(device, run_scene.background, budget, undistorted_folder(out)),
@@ -260,7 +260,11 @@ def resolve_choices(pipeline: Pipeline, run: Run, log_reasons: bool = True) -> P
             for reason in pipeline.reasons if log_reasons else ():
                 LOG.info("%s", reason)
         pipeline = _with_modules(with_lengths(pipeline, run.scene), run)
-        run.settings, run.pipeline, run.model_settings = pipeline.settings, pipeline.resolved(), pipeline.settings.model
+        run.settings, run.pipeline, run.model_settings = (
+            pipeline.settings,
+            pipeline.resolved_settings(),
+            pipeline.settings.model,
+        )
         run.harmonics = pipeline.settings.harmonics
         if any(isinstance(stage, Optimize) for stage in pipeline.stages):
             _warn_about_near_plane(pipeline.settings.model.near, near_depth(run.scene))

@@ -137,7 +137,9 @@ def has_pipeline(folder: Path) -> bool:
 def _difference(old_pipeline: Pipeline, new_pipeline: Pipeline) -> Difference | None:
     """Return the first setting that differs, ignoring automatic choices of the run.  Raises ConfigError."""
     decided_pipeline = with_decisions(new_pipeline, old_pipeline.decisions)
-    old_settings, new_settings = (without_auto(pipeline.resolved()) for pipeline in (old_pipeline, decided_pipeline))
+    old_settings, new_settings = (
+        without_auto(pipeline.resolved_settings()) for pipeline in (old_pipeline, decided_pipeline)
+    )
     return first_difference({**old_settings, "adapt": None}, {**new_settings, "adapt": None})
 
 

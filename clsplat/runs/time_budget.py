@@ -126,7 +126,7 @@ def _execute_until(
         if fraction * report.steps <= report.step < report.steps and not run.interrupted:
             corrected_plans.append(correct(plan, report))
             write_pipeline(corrected_plans[0], run)  # before the checkpoint, so that a resumed run uses it
-            run.settings, run.pipeline = corrected_plans[0].settings, corrected_plans[0].resolved()
+            run.settings, run.pipeline = corrected_plans[0].settings, corrected_plans[0].resolved_settings()
             run.interrupted = True
 
     try:
@@ -209,7 +209,7 @@ def new_run(run: Run, pipeline: Pipeline, **changes: Any) -> Run:
         "metrics": {},
         "changes": [],
     }
-    return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved(), **reset, **changes)
+    return replace(run, settings=pipeline.settings, pipeline=pipeline.resolved_settings(), **reset, **changes)
 
 
 def _add_reports(settings: PipelineFile) -> PipelineFile:

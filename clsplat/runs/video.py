@@ -234,10 +234,10 @@ def view(
     return out
 
 
-def _warn_about_size(models_by_name: Mapping[str, Model], splats: int | None) -> None:
+def _warn_about_size(models_by_name: Mapping[str, Model], max_splats: int | None) -> None:
     """Warn about models with too many splats for a page.  Call this before packing them, which takes minutes."""
     for name, model in models_by_name.items():
-        if min(len(model), splats or len(model)) > MANY_SPLATS:
+        if min(len(model), max_splats or len(model)) > MANY_SPLATS:
             LOG.warning(
                 "%s: %s splats take a long time to pack, and browsers show only %s smoothly; --splats %d keeps the "
                 "most important ones",

@@ -140,7 +140,7 @@ class FileLookup:
                     return True
         return False
 
-    def _target(self, name: str) -> Parts:
+    def _normalized_parts(self, name: str) -> Parts:
         """Return the normalized parts of a name's path, relative to `root` if possible, or () for an invalid name."""
         path = PureWindowsPath(name)
         parts = path.parts[1:] if path.anchor else path.parts
@@ -164,7 +164,7 @@ class FileLookup:
         return files
 
     def _match(self, unmatched: Sequence[int], excluded: set[Path]) -> None:
-        targets = list(map(self._target, self.raw_names)) if unmatched else []
+        targets = list(map(self._normalized_parts, self.raw_names)) if unmatched else []
         targets_by_key = defaultdict[str, set[Parts]](set)
         for target in targets:
             for key in _keys(target):

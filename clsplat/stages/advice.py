@@ -94,7 +94,7 @@ def advise_on_fit(metrics: Sequence[ViewMetrics], is_overfit: bool, rerun: str, 
     if is_overfit:
         yield f"the model overfits: add photos between the existing ones, then `{rerun}`"
     elif train_psnr < LOW_PSNR:
-        yield f"the model underfits: only {train_psnr:.1f} dB at training views; train longer: `{train_longer}`"
+        yield f"the model underfits: only {train_psnr:.1f} dB on training views; train longer: `{train_longer}`"
 
 
 def advise_on_test_views(psnr: Mapping[str, float], rerun: str) -> Iterator[str]:

@@ -25,7 +25,7 @@ from clsplat.training.best_model import Scores
 from clsplat.training.records import PSNR_REPORTS, moving_average
 from clsplat.training.run import Run
 from clsplat.training.stage import Stage, path_in_run
-from clsplat.viewer.charts import COLORS, Line, camera_plans, curve
+from clsplat.viewer.charts import COLORS, Line, camera_plans, line_chart
 
 
 def draw_cameras(run: Run) -> list[Markup]:
@@ -50,11 +50,11 @@ def training_charts(run: Run) -> list[Markup]:
     running_mean = Line(psnr, f"training views, mean of the last {PSNR_REPORTS}", COLORS[0], dash)
     return mark_charts_safe(
         [
-            curve("PSNR, dB", [running_mean, *psnr_lines]),
-            *([curve("PSNR before the refit, dB", trial_lines)] if trial_lines else []),
-            curve("loss", [Line(series["loss"])], logarithmic=True),
-            curve("Gaussians", [Line(series["gaussians"])]),
-            curve("milliseconds per step", [Line(series["ms"])]),
+            line_chart("PSNR, dB", [running_mean, *psnr_lines]),
+            *([line_chart("PSNR before the refit, dB", trial_lines)] if trial_lines else []),
+            line_chart("loss", [Line(series["loss"])], logarithmic=True),
+            line_chart("Gaussians", [Line(series["gaussians"])]),
+            line_chart("milliseconds per step", [Line(series["ms"])]),
         ]
         if records
         else []
@@ -86,10 +86,10 @@ def gaussians_charts(run: Run) -> list[Markup]:
 
     return mark_charts_safe(
         [
-            curve("size (rms scale, scene units), quantiles", quantiles("size"), logarithmic=True),
-            curve("anisotropy (longest / shortest axis), quantiles", quantiles("anisotropy"), logarithmic=True),
-            curve("opacity, quantiles", quantiles("opacity")),
-            curve("Gaussians changed by each rule, total", _totals(run)),
+            line_chart("size (rms scale, scene units), quantiles", quantiles("size"), logarithmic=True),
+            line_chart("anisotropy (longest / shortest axis), quantiles", quantiles("anisotropy"), logarithmic=True),
+            line_chart("opacity, quantiles", quantiles("opacity")),
+            line_chart("Gaussians changed by each rule, total", _totals(run)),
         ]
     )
 

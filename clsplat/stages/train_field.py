@@ -147,7 +147,7 @@ class TrainField(Training):
         Raises NotFiniteError, after saving the state separately, if the loss or the field is not finite.
         """
         loss, error = field.loss(self.coarse_weight)
-        damaged_tables = field.nonfinite_tables()
+        damaged_tables = field.find_nonfinite()
         if damaged_tables or not math.isfinite(loss):
             raise NotFiniteError(f"step {run.step}: the loss is {loss}; {checkpoint.save_failed(run, damaged_tables)}")
         return loss, -10 * math.log10(max(error, 1e-12))

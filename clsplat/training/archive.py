@@ -44,7 +44,7 @@ def read(path: Path) -> tuple[Metadata, Arrays]:
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            _require_sizes(archive, path.stat().st_size)
+            _validate_members(archive, path.stat().st_size)
             metadata = _read_metadata(archive)
             digests = metadata.pop(DIGESTS)
             expected_names = sorted(f"{name}.npy" for name in (*digests, META, META_DIGEST))
@@ -85,7 +85,7 @@ def _add(archive: zipfile.ZipFile, name: str, array: NDArray[Any]) -> str:
     return digest.hexdigest()
 
 
-def _require_sizes(archive: zipfile.ZipFile, size: int) -> None:
+def _validate_members(archive: zipfile.ZipFile, size: int) -> None:
     """Raise DataError if members declare more bytes than the file has, or are compressed or encrypted."""
     members = archive.infolist()
     if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):

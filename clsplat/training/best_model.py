@@ -32,7 +32,7 @@ class Scores(BaseModel):
 
     def text(self, views: str) -> str:
         """Return a sentence with the scores.  views: `test` or `validation`."""
-        psnrs = f"{self.train:.1f} dB at training views and {self.validation:.1f} dB at {views} views"
+        psnrs = f"{self.train:.1f} dB on training views and {self.validation:.1f} dB on {views} views"
         return f"At step {self.step:,} the model has {psnrs}{self.overfit_text()}."
 
     def overfit_text(self, first: "Scores | None" = None) -> str:
@@ -85,7 +85,7 @@ class Best(BaseModel):
     def text(self) -> str:
         """Return a few sentences about the outcome."""
         best, last = self.measured, self.last
-        psnrs = f"{best.train:.1f} dB at training views and {best.validation:.1f} dB at validation views"
+        psnrs = f"{best.train:.1f} dB on training views and {best.validation:.1f} dB on validation views"
         text = f"By the validation views, the model of step {best.step:,} is the best: {psnrs}{best.overfit_text()}."
         if last.step != best.step:
             overfit = last.overfit_text(self.first_overfit)

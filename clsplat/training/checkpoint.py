@@ -284,7 +284,7 @@ def save(run: Run, keep: int | None = None) -> Path:
     """
     if not run.is_consistent:
         raise ClsplatError(f"{run.out}: step {run.step} is incomplete, so it is not saved; resume the run")
-    if bad_tables := run.nonfinite_tables():
+    if bad_tables := run.find_nonfinite():
         raise NotFiniteError(f"step {run.step}: {save_failed(run, bad_tables)}")
     path = _write(run, "refit" if run.is_refit else "step")
     run.status.saved_at = time.monotonic()
@@ -510,7 +510,7 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 
     Raises NotFiniteError, after saving the state as failed_N.npz, if the loss or the model is not finite.
     """
-    bad_tables, loss = run.nonfinite_tables(), losses.loss
+    bad_tables, loss = run.find_nonfinite(), losses.loss
     if bad_tables or not math.isfinite(loss):
         raise NotFiniteError(f"step {run.step}, view '{view}': the loss is {loss}; {save_failed(run, bad_tables)}")
     return loss, psnr(losses.comparison)
@@ -519,7 +519,7 @@ def finite_values(run: Run, view: str, losses: ViewLosses) -> tuple[float, float
 def _save_if_consistent(run: Run) -> str:
     """Save the state if it is consistent and finite; return a clause that reports the result."""
     try:
-        if run.is_consistent and not run.nonfinite_tables() and run.gaussians != 0:
+        if run.is_consistent and not run.find_nonfinite() and run.gaussians != 0:
             return f"the state of step {run.step} is saved in {save(run)}; `clsplat resume` continues from it"
         reason = "the failed step was incomplete" if not run.is_consistent else "the model is not finite"
     except Exception as error:  # must not hide the original failure

@@ -45,7 +45,7 @@ class TrainedField(ABC):
         """Copy the tables to the host, keyed by name."""
 
     @abstractmethod
-    def nonfinite_tables(self) -> list[str]:
+    def find_nonfinite(self) -> list[str]:
         """Return the names of the tables that contain NaN or infinity."""
 
     @classmethod

@@ -113,9 +113,9 @@ class Run:
         """The number of Gaussians; None if a field is trained."""
         return None if self.learned_field else self.model.gaussians.count
 
-    def nonfinite_tables(self) -> list[str]:
+    def find_nonfinite(self) -> list[str]:
         """Return the names of the trained tables that contain NaN or infinity."""
-        return self.learned_field.nonfinite_tables() if self.learned_field else self.model.gaussians.nonfinite_tables()
+        return self.learned_field.find_nonfinite() if self.learned_field else self.model.gaussians.find_nonfinite()
 
     def next_stage(self, index: int) -> None:
         """Move to the start of a stage."""

@@ -29,7 +29,7 @@ class Line:
     dash: int = 0  # index into DASHES, for lines of the same color
 
 
-def curve(
+def line_chart(
     title: str, lines: Sequence[Line], logarithmic: bool = False, ticks: Mapping[float, str] | None = None
 ) -> str:
     """Return a line chart as SVG, or "" if all points have the same x or the same y.
@@ -56,14 +56,16 @@ def curve(
     parts = _svg_start(title)
     for i, row in enumerate(legend, 1):
         parts.append(f'<text x="{LEFT}" y="{15 + LEGEND_ROW * i}">{row}</text>')
-    int_y = not logarithmic and _are_integers(ys)
-    y_ticks = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, int_y)
-    for tick, label in zip(y_ticks, _tick_labels([10**t if logarithmic else t for t in y_ticks], int_y), strict=True):
+    is_y_integer = not logarithmic and _are_integers(ys)
+    y_ticks = _decade_ticks(y_low, y_high) if logarithmic else _ticks(y_low, y_high, is_y_integer)
+    for tick, label in zip(
+        y_ticks, _tick_labels([10**t if logarithmic else t for t in y_ticks], is_y_integer), strict=True
+    ):
         _, y = pixel(x_low, tick)
         parts += _grid_line(y, label)
-    int_x = _are_integers(xs)
-    x_ticks = _ticks(x_low, x_high, int_x)
-    for tick, label in (ticks or dict(zip(x_ticks, _tick_labels(x_ticks, int_x), strict=True))).items():
+    is_x_integer = _are_integers(xs)
+    x_ticks = _ticks(x_low, x_high, is_x_integer)
+    for tick, label in (ticks or dict(zip(x_ticks, _tick_labels(x_ticks, is_x_integer), strict=True))).items():
         x, _ = pixel(tick, y_low)
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 10}" text-anchor="middle">{html.escape(label)}</text>')
     for i, line in enumerate(axis_lines):

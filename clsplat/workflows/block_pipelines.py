@@ -62,7 +62,7 @@ def block_pipeline(
     start: file of the initial Gaussians; extent: of the full scene, in scene units; fraction: of the training steps,
     with learning rates as in `_with_fewer_steps`.
     """
-    data, stage_count, cell = pipeline.resolved(), _count_until_last_edit(pipeline), block.box.model_dump()
+    data, stage_count, cell = pipeline.resolved_settings(), _count_until_last_edit(pipeline), block.box.model_dump()
     stages = [_limit_growth(stage, block) for stage in _with_start(data["stages"][:stage_count], start)]
     names = [view["name"] for view in block.views]
     scene = {**data["scene"], "holdout": 0, "train": {"names": names}, "extent": extent}
@@ -74,16 +74,16 @@ def block_pipeline(
 
 def merged_pipeline(pipeline: Pipeline, file: Path) -> Pipeline:
     """Return a pipeline that starts from the merged model and runs the stages after training, or only an export."""
-    data, stage_count = pipeline.resolved(), _count_until_last_edit(pipeline)
+    data, stage_count = pipeline.resolved_settings(), _count_until_last_edit(pipeline)
     stages = [*_with_start(data["stages"][:1], file), *(data["stages"][stage_count:] or [{"export": {"file": MODEL}}])]
     return check_document(pipeline.path, Document({**data, "stages": stages}))
 
 
 def coarse_pipeline(coarse: Pipeline, pipeline: Pipeline) -> Pipeline:
     """Return the pipeline of the coarse model with the scene, filters, and seed of the block pipeline."""
-    data = pipeline.resolved()
+    data = pipeline.resolved_settings()
     settings = {key: data[key] for key in ("scene", "model", "rasterizer", "seed") if key in data}
-    return check_document(coarse.path, Document({**coarse.resolved(), **settings}))
+    return check_document(coarse.path, Document({**coarse.resolved_settings(), **settings}))
 
 
 def without_start(pipeline: Pipeline) -> Pipeline:

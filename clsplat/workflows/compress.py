@@ -21,7 +21,7 @@ from clsplat.gaussians.model import MODEL, load
 from clsplat.gaussians.sky import read_sky_file, write_sky_file
 from clsplat.pipeline.loading import Pipeline
 from clsplat.runs.model_file import ModelFile
-from clsplat.viewer.charts import Line, curve
+from clsplat.viewer.charts import Line, line_chart
 from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_steps
 
 # The pruning ladder: a series of models, each pruned and fine-tuned from the previous one.
@@ -206,7 +206,7 @@ def page(
         subtitle=f"{model}; PSNR and SSIM of the {split} views, measured on every file after reading it back",
         result=result,
         verdict=_verdict(target, source, best_entry),
-        curves=mark_charts_safe([curve("PSNR, dB, over the file's size, MB", _lines(target, source, entries))]),
+        curves=mark_charts_safe([line_chart("PSNR, dB, over the file's size, MB", _lines(target, source, entries))]),
         headings=HEADINGS,
         rows=[(entry.file, cells(entry, source), entry == best_entry) for entry in (source, *entries)],
     )

@@ -141,7 +141,7 @@ def test_variable_that_changes_code_changes_the_record(monkeypatch, info, variab
     before = quick._record_file(info, "wide", "radix")
     monkeypatch.setenv(variable, "-DTILE=8")
     assert quick._record_file(info, "wide", "radix") != before
-    assert host.system()["environment"][variable] == "-DTILE=8"
+    assert host.describe_host()["environment"][variable] == "-DTILE=8"
 
 
 def test_cache_path_does_not_change_the_record(monkeypatch, info, tmp_path):

@@ -123,8 +123,10 @@ def test_two_variants_of_one_name_are_refused():
 def test_bare_name_means_the_variant_with_defaults(loaded):
     words = loaded("{order: shuffle}", "[l1, dssim]", "[clone, prune_faint]")
     mappings = loaded("{order: {type: shuffle}}", "[{type: l1}, {type: dssim}]", "[{type: clone}, {type: prune_faint}]")
-    assert words.resolved() == mappings.resolved()
-    assert words.resolved() != loaded("{order: stack}", "[l1, dssim]", "[clone, prune_faint]").resolved()
+    assert words.resolved_settings() == mappings.resolved_settings()
+    assert (
+        words.resolved_settings() != loaded("{order: stack}", "[l1, dssim]", "[clone, prune_faint]").resolved_settings()
+    )
 
 
 @pytest.mark.parametrize(

@@ -203,13 +203,13 @@ def test_opacity_is_capped_after_the_world_filter(device, rng):
 @on_devices("value", [np.nan, np.inf, -np.inf])
 def test_nonfinite_values_are_detected(device, rng, value):
     case = random_case(rng, 65)
-    assert case.model(device).gaussians.nonfinite_tables() == []
+    assert case.model(device).gaussians.find_nonfinite() == []
     case.parameters["quats"][64, 2] = value
     case.parameters["sh_rest"][0, 44] = value
     gaussians = case.model(device).gaussians
-    assert gaussians.nonfinite_tables() == ["quats", "sh_rest"]
+    assert gaussians.find_nonfinite() == ["quats", "sh_rest"]
     for table in moment_tables("means"):
         gaussians.add(table, 3)
-    assert gaussians.nonfinite_tables() == ["quats", "sh_rest"]
+    assert gaussians.find_nonfinite() == ["quats", "sh_rest"]
     gaussians[moment_tables("means")[1]].fill(value)
-    assert gaussians.nonfinite_tables() == ["means", "quats", "sh_rest"]
+    assert gaussians.find_nonfinite() == ["means", "quats", "sh_rest"]

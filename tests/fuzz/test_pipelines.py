@@ -52,7 +52,7 @@ def test_damaged_pipeline_is_valid_or_refused(folder):
         pipeline = outcome(load, str(folder / "x.yaml"))
         if pipeline is not None:
             (folder / "again.yaml").write_text(pipeline.text(), encoding="utf-8")
-            assert load(str(folder / "again.yaml")).resolved() == pipeline.resolved()
+            assert load(str(folder / "again.yaml")).resolved_settings() == pipeline.resolved_settings()
 
     reads()
 

@@ -10,7 +10,7 @@ import pytest
 from clsplat.conformance.scenes import random_case
 from clsplat.formats.table import read as read_ply
 from clsplat.metrics.views import QUANTILES, distribution
-from clsplat.viewer.charts import Line, curve
+from clsplat.viewer.charts import Line, line_chart
 from tests.support.runs import train
 
 pytestmark = pytest.mark.slow
@@ -52,15 +52,15 @@ def test_every_rule_and_penalty_has_an_effect(finished):
 
 def test_legends_stay_below_the_title_and_break_into_rows():
     names = ["clone", "split_textured", "split_oversized", "prune_unimportant", "merge_neighbors", "prune_faint"]
-    chart = curve("Gaussians changed by each rule", [Line([(0.0, 0.0), (1.0, 1.0)], name) for name in names])
+    chart = line_chart("Gaussians changed by each rule", [Line([(0.0, 0.0), (1.0, 1.0)], name) for name in names])
     rows = re.findall(r'<text x="56" y="(\d+)">(<tspan.*?)</text>', chart)
     assert [y for y, _ in rows] == ["29", "43"]
     assert re.findall(r">(\w+)</tspan>", "".join(row for _, row in rows)) == names
-    assert "<tspan" not in curve("loss", [Line([(0.0, 0.0), (1.0, 1.0)], "alone")])
+    assert "<tspan" not in line_chart("loss", [Line([(0.0, 0.0), (1.0, 1.0)], "alone")])
 
 
 def test_narrow_logarithmic_axis_has_tick_labels():
-    chart = curve("anisotropy", [Line([(0.0, 1.05), (1.0, 1.7)])], logarithmic=True)
+    chart = line_chart("anisotropy", [Line([(0.0, 1.05), (1.0, 1.7)])], logarithmic=True)
     assert re.findall(r'text-anchor="end">([\d.]+)<', chart) == ["1.2", "1.4", "1.6"]
 
 

@@ -46,7 +46,7 @@ def test_transforms_come_with_every_sample(tiny_scene):
 def test_run_with_changing_views_is_the_same_after_a_stop(tiny_scene, tmp_path, setting):
     few = "optimize.steps=24"
     whole = train(tiny_scene, tmp_path / "whole", few, setting)
-    assert load(str(whole.out / "pipeline.yaml")).resolved() == without_auto(whole.pipeline)
+    assert load(str(whole.out / "pipeline.yaml")).resolved_settings() == without_auto(whole.pipeline)
     checked = load("smoke", [f"scene.path='{tiny_scene}'", few, setting])
     out = tmp_path / "stopped"
     for stop_at in (10, 20):

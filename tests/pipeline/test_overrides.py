@@ -13,10 +13,10 @@ def test_every_listed_key_can_be_set_to_its_listed_value(name):
     pipeline = load(name)
     keys = list_keys(pipeline.settings)
     assert len({key.key_path for key in keys}) == len(keys)
-    listed = {**pipeline.resolved(), "adapt": None}  # which keeps keys that are set
+    listed = {**pipeline.resolved_settings(), "adapt": None}  # which keeps keys that are set
     together = [key.text for key in keys]
     for overrides in (together, together[::-1]):  # one that changes another key is seen in one of the orders
-        assert {**load(name, overrides).resolved(), "adapt": None} == listed, overrides
+        assert {**load(name, overrides).resolved_settings(), "adapt": None} == listed, overrides
 
 
 def test_listed_keys_have_an_effect():

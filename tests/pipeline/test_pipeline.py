@@ -59,7 +59,9 @@ def test_shipped_pipelines_are_valid_and_resolve_to_themselves(write):
     faults = [f"{name}: is named {one.settings.name}" for name, one in pipelines.items() if one.settings.name != name]
     again = {name: load(write(one.text())) for name, one in pipelines.items()}
     faults += [
-        f"{name}: resolves to another" for name in SHIPPED if again[name].resolved() != pipelines[name].resolved()
+        f"{name}: resolves to another"
+        for name in SHIPPED
+        if again[name].resolved_settings() != pipelines[name].resolved_settings()
     ]
     assert not faults, "\n".join(faults)
 
@@ -96,7 +98,7 @@ def test_representative_recipes_cover_all_kinds():
 
 @functools.cache
 def settings_of(recipe: str) -> dict[str, object]:
-    return flat(shipped(recipe).resolved())
+    return flat(shipped(recipe).resolved_settings())
 
 
 def changes(base: str, recipe: str) -> set[str]:
@@ -287,8 +289,8 @@ def test_short_pipeline_applies_the_short_values(write, tmp_path):
     short = str(tmp_path / "small_7k.yaml")
     values = ("steps=5", "losses.1.weight=0.1", "during.0.every=2", "during.1.every=3")
     expected = load(write(SMALL), ["name=small_7k", *(f"optimize.{value}" for value in values)])
-    assert load(short).resolved() == expected.resolved()
-    assert load(str(tmp_path / "small.yaml")).resolved() == load(write(SMALL)).resolved()
+    assert load(short).resolved_settings() == expected.resolved_settings()
+    assert load(str(tmp_path / "small.yaml")).resolved_settings() == load(write(SMALL)).resolved_settings()
     edited = copy(short, tmp_path / "mine.yaml").read_text()
     assert edited.startswith("# Small, in 5 steps.\n#\n# Small.\nname: small_7k\n")
     assert edited.endswith("- export\n")
@@ -300,7 +302,7 @@ def test_variants_before_other_keys_leave_those_as_they_are(write, tmp_path):
     (tmp_path / "small.yaml").write_text(head + variants + stages)
     for name, steps in (("small_draft", 4), ("small_high", 40)):
         expected = load(write(SMALL), [f"name={name}", f"optimize.steps={steps}"])
-        assert load(str(tmp_path / f"{name}.yaml")).resolved() == expected.resolved()
+        assert load(str(tmp_path / f"{name}.yaml")).resolved_settings() == expected.resolved_settings()
 
 
 @pytest.mark.parametrize(
@@ -324,7 +326,7 @@ def test_variant_keys_are_set_keys():
         for key in data.keys() & files.ENDINGS.keys():
             variant = name + files.ENDINGS[key]
             overrides = [f"{key_path}={json.dumps(value)}" for key_path, value in data[key].items()]
-            assert load(name, [f"name={variant}", *overrides]).resolved() == load(variant).resolved()
+            assert load(name, [f"name={variant}", *overrides]).resolved_settings() == load(variant).resolved_settings()
 
 
 def replaced(old: str, new: str) -> str:

@@ -52,7 +52,7 @@ def write(folder: Path, name: str, text: str) -> Path:
 def test_class_in_a_file_is_a_variant(tmp_path):
     plugins.load_file(write(tmp_path, "mine", RULE.format(name="mine")))
     assert "mine" in variants(Rule)
-    assert load("splat", ["densify.rules=[mine]"]).resolved()["plugins"].keys() == {"mine"}
+    assert load("splat", ["densify.rules=[mine]"]).resolved_settings()["plugins"].keys() == {"mine"}
 
 
 def test_curve_in_a_file_is_a_schedule(tmp_path):
@@ -79,7 +79,7 @@ class Wave(Curve):
 
 
 def test_shipped_pipelines_name_no_plugin():
-    assert "plugins" not in load("splat").resolved()
+    assert "plugins" not in load("splat").resolved_settings()
 
 
 def test_schema_includes_plugins(tmp_path):
@@ -171,8 +171,8 @@ def test_entry_points_are_loaded_and_recorded_where_used(tmp_path, monkeypatch):
     entry = EntryPoint("a_package", "installed_rule", plugins.GROUP)
     monkeypatch.setattr(plugins, "entry_points", lambda group: [entry])
     plugins.load_installed()
-    assert "plugins" not in load("splat").resolved()
-    assert load("splat", ["densify.rules=[installed]"]).resolved()["plugins"].keys() == {"a_package"}
+    assert "plugins" not in load("splat").resolved_settings()
+    assert load("splat", ["densify.rules=[installed]"]).resolved_settings()["plugins"].keys() == {"a_package"}
     sys.modules.pop("installed_rule")
 
 

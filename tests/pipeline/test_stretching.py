@@ -20,7 +20,8 @@ STEPS = ("steps", "start", "stop", "over", "until", "every")
 def changes(name: str, factor: float) -> dict[str, tuple[object, object]]:
     pipeline = load(name)
     old, new = (
-        flat(item.resolved()) for item in (pipeline, replace(pipeline, settings=stretch(pipeline.settings, factor)))
+        flat(item.resolved_settings())
+        for item in (pipeline, replace(pipeline, settings=stretch(pipeline.settings, factor)))
     )
     assert old.keys() == new.keys()
     return {place: (old[place], new[place]) for place in old if old[place] != new[place]}
@@ -51,7 +52,7 @@ def test_only_steps_change_and_all_of_them(name):
             assert new in (2 * old, 2 * old - place.endswith(".stop")), place
     stretchable = [
         place
-        for place, value in flat(load(name).resolved()).items()
+        for place, value in flat(load(name).resolved_settings()).items()
         if place.endswith((".steps", ".start", ".stop", ".over", ".until")) and isinstance(value, int) and value
     ]
     assert set(stretchable) <= result.keys()

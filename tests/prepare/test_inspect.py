@@ -421,7 +421,7 @@ def test_photographs_that_show_nothing_stop_inspection_and_run(scene, kind, capl
 def test_masks(scene):
     (scene / "masks").mkdir()
     photograph(scene / "masks" / "00.png")
-    assert (Inspection.from_folder(scene).facts.photos.masks, Inspection.from_folder(scene).findings) == (1, [])
+    assert (Inspection.from_folder(scene).facts.photos.mask_count, Inspection.from_folder(scene).findings) == (1, [])
     photograph(scene / "masks" / "01.png", (32, 20))
     assert "mask of 01.png is 32x20, its camera 64x48" in finding_text(Inspection.from_folder(scene), "error")
     with pytest.raises(DataError):

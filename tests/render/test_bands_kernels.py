@@ -125,13 +125,13 @@ def test_frame_with_too_little_room_is_repeated(device, rng, missing, sort):
     weights = rng.normal(size=(3, 70, 60)).astype(np.float32)
     image, pixel_sums, frame = results(device, case, weights)
     pairs, rasterizer = frame.lists.pairs, Rasterizer(device, sort)
-    rasterizer.tiler._room = pairs - missing if missing else 1
+    rasterizer.tiler._capacity = pairs - missing if missing else 1
     incomplete = rasterizer.start_forward(case.model(device), case.device_camera(device), device.zeros(3))
     assert not incomplete.lists.tile_offset.get()[: incomplete.camera.tiles + 1].any()
     assert not incomplete.image.get().any()
-    rasterizer.tiler._room = pairs - missing if missing else 1
+    rasterizer.tiler._capacity = pairs - missing if missing else 1
     repeated_image, repeated_sums, repeated = results(device, case, weights, rasterizer=rasterizer)
-    assert repeated.lists.room >= pairs
+    assert repeated.lists.capacity >= pairs
     np.testing.assert_array_equal(repeated_image, image)
     np.testing.assert_array_equal(repeated_sums, pixel_sums)
 

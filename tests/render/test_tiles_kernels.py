@@ -213,7 +213,7 @@ def _emitted(device, frame, box, mask, count):
         tile_mask=device.upload(mask),
         order=device.upload(np.arange(len(count), dtype=np.uint32)),
         pair_offset=device.upload(offset),
-        room=int(offset[-1]),
+        capacity=int(offset[-1]),
         **written,
         **size,
     )

@@ -180,15 +180,15 @@ def test_each_scene_and_size_has_a_table(make_run, tiny_scene, tmp_path):
 
 
 def test_differing_settings_are_matched_by_name():
-    first = flatten(load("splat").resolved())
+    first = flatten(load("splat").resolved_settings())
     assert first["optimize.steps"] == "30000"
     assert first["optimize.densify.clone.gradient_above"] == "0.0002"
     assert first["optimize.reset_opacity#2.when_background"] == "white"
     assert first["optimize.dssim.weight"] == "0.2"
-    two = flatten(load("splat", ["optimize.losses[0].weight=0.7", "optimize.densify.stop=900"]).resolved())
+    two = flatten(load("splat", ["optimize.losses[0].weight=0.7", "optimize.densify.stop=900"]).resolved_settings())
     assert differing_keys([first, two]) == ["optimize.l1.weight", "optimize.densify.stop"]
     assert differing_keys([first, first]) == []
-    short = flatten(load("smoke").resolved())
+    short = flatten(load("smoke").resolved_settings())
     assert "optimize.densify.prune_large.start" in differing_keys([first, short]), "a rule that only one has"
 
 

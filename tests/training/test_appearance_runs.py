@@ -160,8 +160,10 @@ def test_reason_names_the_deciding_bound(spread, explained, chosen, said):
 
 
 def test_decision_is_not_written_as_a_setting():
-    asked = load("smoke", ["optimize.modules.exposure.when=auto"]).resolved()
-    chosen = load("smoke", ["optimize.modules.exposure={when: auto, chosen: on, reason: they differ}"]).resolved()
+    asked = load("smoke", ["optimize.modules.exposure.when=auto"]).resolved_settings()
+    chosen = load(
+        "smoke", ["optimize.modules.exposure={when: auto, chosen: on, reason: they differ}"]
+    ).resolved_settings()
     assert asked != chosen
     assert without_auto(asked) == without_auto(chosen)
-    assert without_auto(asked) != without_auto(load("smoke").resolved())
+    assert without_auto(asked) != without_auto(load("smoke").resolved_settings())

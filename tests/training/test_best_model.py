@@ -401,8 +401,8 @@ def test_checkpoint_without_its_best_model_is_damaged(best_run):
 @pytest.mark.parametrize(
     ("train_", "validation", "expected"),
     [
-        (26.0, 20.0, "At step 8 the model has 26.0 dB at training views and 20.0 dB at validation views."),
-        (26.1, 20.0, "20.0 dB at validation views, more than 6 dB apart: the model overfits."),
+        (26.0, 20.0, "At step 8 the model has 26.0 dB on training views and 20.0 dB on validation views."),
+        (26.1, 20.0, "20.0 dB on validation views, more than 6 dB apart: the model overfits."),
     ],
 )
 def test_six_decibels_apart_is_overfit(train_, validation, expected):
@@ -416,7 +416,7 @@ def test_run_without_validation_reports_overfitting(tiny_scene, tmp_path, pipeli
     assert not is_overfit(run)
     run.records.add(8, "evaluate", split="train", downscale=1, psnr=40.0, ssim=1.0)
     run.records.write()
-    assert "40.0 dB at training views" in overfitting_note(run)
-    assert "dB at test views, more than 6 dB apart: the model overfits" in overfitting_note(run)
+    assert "40.0 dB on training views" in overfitting_note(run)
+    assert "dB on test views, more than 6 dB apart: the model overfits" in overfitting_note(run)
     assert "`scene.validation: auto` with `optimize.keep: best`" in overfitting_note(run)
     assert is_overfit(run)

@@ -57,7 +57,7 @@ class Views(ColorState):
         return ColorReport(dict.fromkeys(self.views, IDENTITY), facts)
 
     def update(self, step):
-        self.scalars[f"colors/{self.views[step.view]}/steps"] += 1
+        self.scalars[f"colors/{self.views[step.view_index]}/steps"] += 1
 '''
 GRID = (*FEW, "optimize.modules.bilateral_grid={grid_shape: [3, 2, 4]}")
 

@@ -183,6 +183,6 @@ def test_error_explains_that_rows_are_on_the_host(device, rng):
     with pytest.raises(ConfigError, match="is in host memory"):
         model.gaussians["sh_rest"]
     before[3, 7] = np.nan
-    assert model.gaussians.nonfinite_tables() == []
+    assert model.gaussians.find_nonfinite() == []
     model.gaussians.set("sh_rest", before)
-    assert model.gaussians.nonfinite_tables() == ["sh_rest"]
+    assert model.gaussians.find_nonfinite() == ["sh_rest"]

@@ -164,7 +164,7 @@ def test_distractors_are_in_no_output_and_bits_repeat(tiny_scene, tmp_path, few_
 def test_distractors_combine_with_other_modules(tiny_scene, tmp_path, others):
     run = train(tiny_scene, tmp_path / "run", *ON, *others)
     assert "distractors" not in run.modules
-    assert not run.nonfinite_tables()
+    assert not run.find_nonfinite()
     tables = checkpoint.load(checkpoint.list_files(tmp_path / "run")[-1])[1]
     assert split(tables, "modules/distractors/")[0]["updates"].sum() == 12 - 4
 

@@ -16,7 +16,7 @@ from clsplat.training.stage import Scheduled, Stage
 
 def kinds(before, after) -> dict[str, str | None]:
     """The kind of each difference between two pipelines, by place."""
-    result = differences(before.resolved(), after.resolved(), after.settings)
+    result = differences(before.resolved_settings(), after.resolved_settings(), after.settings)
     return {difference.key_path: difference.kind for difference in result}
 
 

@@ -166,8 +166,8 @@ def test_counted_opaque_pixels_can_show_sky(tmp_path, rng, alpha, masked, size, 
 
 
 def test_decision_is_not_written_as_a_setting():
-    asked = load("smoke", ["model.background=auto"]).resolved()
-    chosen = load("smoke", ["model.background={type: auto, chosen: on, reason: it is blue}"]).resolved()
+    asked = load("smoke", ["model.background=auto"]).resolved_settings()
+    chosen = load("smoke", ["model.background={type: auto, chosen: on, reason: it is blue}"]).resolved_settings()
     assert asked != chosen
     assert without_auto(asked) == without_auto(chosen)
 

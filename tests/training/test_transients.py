@@ -38,7 +38,7 @@ def test_all_pixels_count_without_outliers():
 def test_distribution_fades():
     settings, scalars = Transients(start=0, decay=0.5), {}
     for _ in range(2):
-        settings.learn(scalars, np.eye(BINS, dtype=np.uint32)[3] * 8)
+        settings.update_histogram(scalars, np.eye(BINS, dtype=np.uint32)[3] * 8)
     assert scalars == {key: 12.0 if key == KEYS[3] else 0.0 for key in KEYS}
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.stages.report import training_charts
 from clsplat.training.records import PSNR_REPORTS, Forecast, moving_average
-from clsplat.viewer.charts import HEIGHT, Line, curve, histogram
+from clsplat.viewer.charts import HEIGHT, Line, histogram, line_chart
 
 
 def rows(chart: str) -> list[str]:
@@ -22,8 +22,8 @@ def columns(chart: str) -> list[str]:
 
 def test_nonfinite_points_are_omitted():
     odd = [(1, float("nan")), (2, float("inf")), (3, 5.0), (4, 6.0)]
-    assert rows(curve("a", [Line(odd)])) == rows(curve("a", [Line(odd[2:])]))
-    assert curve("a", [Line(odd[:2])], logarithmic=True) == ""
+    assert rows(line_chart("a", [Line(odd)])) == rows(line_chart("a", [Line(odd[2:])]))
+    assert line_chart("a", [Line(odd[:2])], logarithmic=True) == ""
 
 
 @pytest.mark.parametrize(("counts", "labels"), [
@@ -35,18 +35,18 @@ def test_nonfinite_points_are_omitted():
     ((156_855, 157_062), ["156.9k", "157k"]),
 ])  # fmt: skip
 def test_ticks_of_counts_are_integers(counts, labels):
-    chart = curve("Gaussians", [Line(list(zip((10.0, 20.0), map(float, counts), strict=True)))])
+    chart = line_chart("Gaussians", [Line(list(zip((10.0, 20.0), map(float, counts), strict=True)))])
     assert rows(chart) == labels
 
 
 def test_charts_with_a_single_value_are_omitted():
-    assert curve("Gaussians", [Line([(10.0, 8.0), (20.0, 8.0)])]) == ""
-    assert curve("PSNR", [Line([(10.0, 8.0)]), Line([(10.0, 9.0)])]) == ""
+    assert line_chart("Gaussians", [Line([(10.0, 8.0), (20.0, 8.0)])]) == ""
+    assert line_chart("PSNR", [Line([(10.0, 8.0)]), Line([(10.0, 9.0)])]) == ""
     assert histogram("points", [7.0, 7.0]) == ""
 
 
 def test_only_ticks_of_steps_are_integers():
-    chart = curve("PSNR, dB", [Line([(1.0, 20.5), (3.0, 21.25)])])
+    chart = line_chart("PSNR, dB", [Line([(1.0, 20.5), (3.0, 21.25)])])
     assert columns(chart) == ["0", "1", "2", "3"]
     assert rows(chart) == ["20.6", "20.8", "21", "21.2"]
     assert rows(histogram("points", [1.0, 5.0])) == ["0", "1"]
@@ -54,7 +54,7 @@ def test_only_ticks_of_steps_are_integers():
 
 def test_lines_of_one_color_have_different_dashes():
     points = [(0.0, 0.0), (1.0, 1.0)]
-    chart = curve("PSNR", [Line(points, "A one", "#123456"), Line(points, "A two", "#123456", dash=1)])
+    chart = line_chart("PSNR", [Line(points, "A one", "#123456"), Line(points, "A two", "#123456", dash=1)])
     assert re.findall(r">([^<]+)</tspan>", chart) == ["A one", "A two (dashed)"]
     assert chart.count("stroke-dasharray") == 1
 

@@ -73,7 +73,7 @@ def test_titles_name_the_given_folder(run, tiny_scene, tmp_path, monkeypatch):
 
 
 def test_report_links_files_of_one_name_in_several_folders(tiny_scene, tmp_path):
-    steps = [stage for stage in load("smoke").resolved()["stages"] if "render" not in stage]
+    steps = [stage for stage in load("smoke").resolved_settings()["stages"] if "render" not in stage]
     at = next(i for i, stage in enumerate(steps) if "export" in stage)
     steps[at : at + 1] = [{"export": {"file": f"{folder}/model.ply"}} for folder in ("a", "b")]
     (tmp_path / "two.yaml").write_text(json.dumps({"name": "two", "stages": steps}))

@@ -12,7 +12,7 @@ from jinja2 import UndefinedError
 
 import clsplat as package
 from clsplat.core.page import TEMPLATES, data_url, duration_text, mark_charts_safe, render, require_complete
-from clsplat.viewer.charts import Line, curve
+from clsplat.viewer.charts import Line, line_chart
 from tests.support.commands import clsplat
 from tests.support.html_page import HOSTILE, Page
 from tests.support.refusals import refusal
@@ -104,7 +104,7 @@ def test_every_template_file_is_part_of_a_page():
 
 def test_values_are_escaped_and_charts_are_not():
     values = {"state": "ready", "verdict": HOSTILE, "findings": [], "facts": {HOSTILE: HOSTILE}, "cameras": []}
-    chart = curve(HOSTILE, [Line([(0.0, 0.0), (1.0, 1.0)])])
+    chart = line_chart(HOSTILE, [Line([(0.0, 0.0), (1.0, 1.0)])])
     seen = mark_charts_safe([chart, ""]), [(HOSTILE, 3)]
     page = Page(
         render("inspect.html.j2", title=HOSTILE, subtitle=HOSTILE, points_per_view=seen, far="", lists=[], **values)

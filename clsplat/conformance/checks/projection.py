@@ -236,7 +236,7 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator, views: in
     rasterizer, background = Rasterizer(device, "radix"), device.upload(np.full(3, 0.25, np.float32))
     for view in sorted({0, min(HIDDEN_VIEWS, views) - 1, views - 1}):
         label = f"hidden Gaussians of {count}, view {view} of {views}"
-        frame = rasterizer.forward(model, replace(camera, view=view), background)
+        frame = rasterizer.forward(model, replace(camera, view_index=view), background)
         actual, hidden = frame.image.get().copy(), hidden_masks[view]
         yield match("project_forward", f"records of {label}", frame.splats.get()[hidden], 0.0)
         yield match("project_forward", f"depths of {label}", frame.depth_key.get()[:count][hidden], CULLED)

@@ -51,11 +51,11 @@ def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, 
     depth_key = rng.integers(0, max_key, pairs).astype(np.uint32)
     pair_splat = np.arange(pairs, dtype=np.uint32)
     upload = device.upload
-    room = pairs + 70  # the device reads the number of pairs
+    capacity = pairs + 70  # the device reads the number of pairs
     tile_slots, splat_slots = (upload(np.append(array, np.zeros(70, np.uint32))) for array in (pair_tile, pair_splat))
     pair_count = upload(np.array([pairs], np.uint32))
     offsets, sorted_pairs = make_tiler(device, "bitonic")._sort_in_tiles(
-        tile_slots, splat_slots, upload(depth_key), pair_count, room, tiles
+        tile_slots, splat_slots, upload(depth_key), pair_count, capacity, tiles
     )
     actual = offsets.get()
     yield match("count_pairs", "offsets of tiles", actual, np.concatenate([[0], np.cumsum(lengths)]))
@@ -195,15 +195,15 @@ def check_wrong_counts(device: Device, case: Case) -> Results:
     is_large = (box.get() >> 24 == 33) & (actual > 0)
     for extra in SURPLUS:
         counts = np.where(is_large, np.maximum(1, actual + extra), 0)
-        first = np.concatenate([[0], np.cumsum(counts)])
-        arrays = [device.upload(np.full(first[-1] + 64, UNTOUCHED, np.uint32)) for _ in range(2)]
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        arrays = [device.upload(np.full(offsets[-1] + 64, UNTOUCHED, np.uint32)) for _ in range(2)]
         device.program("large.cl").emit_large(
             groups=1,
             splats=frame.splats,
             tile_box=box,
             tile_count=device.upload(counts.astype(np.uint32)),
-            first_pair=device.upload(first[:-1].astype(np.uint32)),
-            pair_count=device.upload(first[-1:].astype(np.uint32)),
+            first_pair=device.upload(offsets[:-1].astype(np.uint32)),
+            pair_count=device.upload(offsets[-1:].astype(np.uint32)),
             pair_tile=arrays[0],
             pair_splat=arrays[1],
             tiles_x=camera.tiles_x,

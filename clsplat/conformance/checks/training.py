@@ -235,7 +235,7 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
     for value in (np.nan, np.inf, -np.inf):
         case = random_case(rng, 65)
         case.parameters["quats"][64, 2] = case.parameters["sh_rest"][0, 44] = value
-        actual = case.model(device).gaussians.nonfinite_tables()
+        actual = case.model(device).gaussians.find_nonfinite()
         wrong_names = {"quats", "sh_rest"} ^ set(actual)
         yield Deviation("count_not_finite", f"tables with {value}", len(wrong_names), 0, counts=True)
 
@@ -355,7 +355,7 @@ def check_hidden(device: Device, case: Case, rng: np.random.Generator) -> Result
     model, camera, count = case.model(device), case.device_camera(device), len(case.parameters["means"])
     hidden_masks = rng.random((2, count)) < 0.5
     hide(model.gaussians, hidden_masks)
-    actual = Rasterizer(device, "radix").forward(model, replace(camera, view=1), device.zeros(3)).splats.get()
+    actual = Rasterizer(device, "radix").forward(model, replace(camera, view_index=1), device.zeros(3)).splats.get()
     expected, _, _ = project_records(device, case)
     expected[hidden_masks[1]] = 0
     yield match("draw_left_out", f"records of {count} Gaussians, some dropped and some hidden", actual, expected)

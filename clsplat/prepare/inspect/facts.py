@@ -246,9 +246,9 @@ class PhotographFacts:
     misfits: dict[str, str]  # files whose size differs from the camera's, with both sizes
     on_side: list[str]  # misfits whose width and height are swapped
     exif_turned: list[str]  # files that are read as stored although EXIF contains a rotation
-    masks: int  # number of views with a mask
+    mask_count: int  # views with a mask
     blank: list[str]  # photographs of training views that are black, of one color, or transparent
-    no_content: str  # reason why training cannot use the files: masks exclude all pixels, or all are blank
+    unusable_reason: str  # reason why training cannot use the files: masks exclude all pixels, or all are blank
 
 
 @dataclass(frozen=True)
@@ -421,13 +421,13 @@ def measure_capture(files: Sequence[Path]) -> CaptureFacts:
 def _photographs(parts: Parts, missing_files: set[Path]) -> PhotographFacts:
     views = parts.views
     decoded_files = decode_all(view for view in views if view.image_path not in missing_files)
-    blank, no_content = list[str](), ""
+    blank, unusable_reason = list[str](), ""
     try:
         blank = require_content(parts.path, parts.scene.split("train") if parts.scene else views, decoded_files)
     except DataError as error:
-        no_content = str(error)
-    masks = sum(view.mask_path is not None for view in views)
-    facts = PhotographFacts({}, [], {}, [], [], masks, blank, no_content)
+        unusable_reason = str(error)
+    mask_count = sum(view.mask_path is not None for view in views)
+    facts = PhotographFacts({}, [], {}, [], [], mask_count, blank, unusable_reason)
     for view in views:
         files = {view.name: view.image_path, f"mask of {view.name}": view.mask_path}
         files[f"static mask of {view.name}"] = view.static_path

@@ -128,8 +128,8 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
         reason = next(iter(photographs.unreadable.values())).partition(";")[0]
         fault = f"{pluralize(len(photographs.unreadable), 'image file')} cannot be decoded ({unreadable})"
         yield Finding("error", fault, f"{reason}; {remedy_for({unreadable: reason})}")
-    if photographs.no_content:
-        fault, _, remedy = photographs.no_content.removeprefix(f"{facts.path}: ").rpartition("; ")
+    if photographs.unusable_reason:
+        fault, _, remedy = photographs.unusable_reason.removeprefix(f"{facts.path}: ").rpartition("; ")
         yield Finding("error", fault, remedy)
     if photographs.blank:
         fault = f"{_are(len(photographs.blank), 'photo')} black, of a single color, or transparent"
@@ -400,7 +400,7 @@ def _image_counts(facts: Facts) -> str:
     parts += [f"{len(facts.missing)} of them missing from disk"] if facts.missing else []
     parts += [f"{len(facts.unregistered)} more on disk without a pose"] if facts.unregistered else []
     parts += [f"in {facts.folders} folders"] if facts.folders > 1 else []
-    parts += [f"{facts.photos.masks} with a mask"] if facts.photos.masks else []
+    parts += [f"{facts.photos.mask_count} with a mask"] if facts.photos.mask_count else []
     return ", ".join(parts)
 
 

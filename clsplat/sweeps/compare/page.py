@@ -19,7 +19,7 @@ from clsplat.runs.results import Curve, RunFolder, RunMetrics
 from clsplat.sweeps.compare.comparison import PublishedTable, RunComparison, Variant, VariantRow, differing_keys
 from clsplat.sweeps.compare.crops import ImageCrop, find_crops
 from clsplat.training.records import PSNR_REPORTS, moving_average
-from clsplat.viewer.charts import COLORS, Line, curve
+from clsplat.viewer.charts import COLORS, Line, line_chart
 
 # The tables: metrics and costs, means over scenes, differing settings.
 
@@ -242,13 +242,13 @@ def curves(rows: Sequence[VariantRow]) -> list[Markup]:
         return list(zip([step for step, _ in points], moving_average([psnr for _, psnr in points]), strict=True))
 
     charts = [
-        curve(f"test PSNR over steps, dB{suffix}", lines(test_points)),
-        curve(
+        line_chart(f"test PSNR over steps, dB{suffix}", lines(test_points)),
+        line_chart(
             f"test PSNR over CPU seconds of training, dB{suffix}",
             lines(lambda run: run.over_cpu_seconds(test_points(run))),
         ),
-        curve(f"training PSNR over steps, mean of {PSNR_REPORTS} views, dB{suffix}", lines(training_points)),
-        curve(f"Gaussians over steps{suffix}", lines(lambda run: run.curve("train", "gaussians"))),
+        line_chart(f"training PSNR over steps, mean of {PSNR_REPORTS} views, dB{suffix}", lines(training_points)),
+        line_chart(f"Gaussians over steps{suffix}", lines(lambda run: run.curve("train", "gaussians"))),
     ]
     return mark_charts_safe(charts + _size_charts(rows, "test") + _size_charts(rows, "train"))
 
@@ -284,7 +284,7 @@ def _size_charts(rows: Sequence[VariantRow], split: str) -> list[str]:
         for row in rows:
             points = [(float(i), row.values(split, size, metric)) for i, size in enumerate(sizes)]
             lines.append(Line([(i, fmean(values)) for i, values in points if values], color=row.variant.color))
-        charts.append(curve(title, lines, ticks=ticks))
+        charts.append(line_chart(title, lines, ticks=ticks))
     return charts
 
 

@@ -57,9 +57,9 @@ class TrainingStep:
         return self.photograph.camera
 
     @property
-    def view(self) -> int | None:
+    def view_index(self) -> int | None:
         """The index of the training view; None for other images, which modules do not change."""
-        return self.photograph.camera.view
+        return self.photograph.camera.view_index
 
     @property
     def workspace(self) -> Workspace:

@@ -134,24 +134,24 @@ class GridState(ColorState):
         return self.names.index(self.views[view])
 
     def after_render(self, step: TrainingStep) -> None:
-        if step.view is None:
+        if step.view_index is None:
             return
         image = step.image
-        step.image = self.transform(step.workspace, step.camera, image, step.view)
-        terms = self.smoothness(step.workspace, step.view)
+        step.image = self.transform(step.workspace, step.camera, image, step.view_index)
+        terms = self.smoothness(step.workspace, step.view_index)
         step.module_losses.append(LossValue("colors", lambda: float(terms.get().sum(dtype=np.float64))))
         step.save(self, (image, []))
 
     def backward(self, step: TrainingStep) -> None:
-        if (saved := step.saved_value(self)) and step.view is not None:
+        if (saved := step.saved_value(self)) and step.view_index is not None:
             step.gradient, grad_grid = self.differentiate(
-                step.workspace, step.camera, saved[0], step.gradient, step.view
+                step.workspace, step.camera, saved[0], step.gradient, step.view_index
             )
             saved[1].append(grad_grid)
 
     def update(self, step: TrainingStep) -> None:
-        if (saved := step.saved_value(self)) and step.view is not None:
-            self.learn(step.workspace, step.view, saved[1][0], step.number)
+        if (saved := step.saved_value(self)) and step.view_index is not None:
+            self.learn(step.workspace, step.view_index, saved[1][0], step.number)
 
     def report(self) -> ColorReport:
         values = self.arrays["values"].get()

@@ -207,21 +207,21 @@ class CameraState(ModuleState):
             require_zoom(run.original)
 
     def before_render(self, step: TrainingStep) -> None:
-        if step.view is not None and step.number > self.settings.start:
-            zoom, pose = self.factor(self.views[step.view].name), self.pose(step.view)
+        if step.view_index is not None and step.number > self.settings.start:
+            zoom, pose = self.factor(self.views[step.view_index].name), self.pose(step.view_index)
             step.photograph = replace(step.photograph, camera=move_camera(step.workspace, step.camera, pose, zoom))
 
     def after_backward(self, step: TrainingStep) -> None:
-        if step.view is not None and step.number > self.settings.start:
+        if step.view_index is not None and step.number > self.settings.start:
             step.save(self, pose_gradient(step.workspace, step.model, step.frame, step.pixel_sums))
 
     def update(self, step: TrainingStep) -> None:
-        if not (download := step.saved_value(self)) or step.view is None:
+        if not (download := step.saved_value(self)) or step.view_index is None:
             return
-        sums, name, (rotations, translations) = download(), self.views[step.view].name, self.pose_tables
+        sums, name, (rotations, translations) = download(), self.views[step.view_index].name, self.pose_tables
         change = self.pose_change(name)
         rotation_rate, translation_rate, zoom_rate = (at_step(r, step.number) for r in self.rates)
-        grad_rotation, grad_translation = change.gradients(self.pose(step.view), sums[:3], sums[3:6])
+        grad_rotation, grad_translation = change.gradients(self.pose(step.view_index), sums[:3], sums[3:6])
         rotations.update(self.scalars, name, grad_rotation, rotation_rate)
         translations.update(self.scalars, name, grad_translation, change.depth * translation_rate)
         self.zoom(name, float(sums[6]), zoom_rate)

@@ -74,8 +74,8 @@ class CameraResponseState(ModuleState):
         return TABLE.row(self.scalars, self.cameras[view])
 
     def after_render(self, step: TrainingStep) -> None:
-        if step.view is not None:
-            row, weight = self.row(self.views[step.view]), at_step(self.settings.weight, step.number)
+        if step.view_index is not None:
+            row, weight = self.row(self.views[step.view_index]), at_step(self.settings.weight, step.number)
             step.module_losses.append(LossValue("response", lambda: weight * float(row @ row)))
             step.save(self, (step.image, row, 2 * weight * row, []))
             step.image = respond(step.workspace, step.camera, step.image, row)
@@ -86,9 +86,9 @@ class CameraResponseState(ModuleState):
             saved[3].append(step.workspace.array("response sums", (20, step.camera.rows)).get_later())
 
     def update(self, step: TrainingStep) -> None:
-        if (saved := step.saved_value(self)) and step.view is not None:
+        if (saved := step.saved_value(self)) and step.view_index is not None:
             gradient, rate = row_gradient(saved[1], saved[3][0]()) + saved[2], at_step(self.settings.rate, step.number)
-            TABLE.update(self.scalars, self.cameras[self.views[step.view]], gradient, rate)
+            TABLE.update(self.scalars, self.cameras[self.views[step.view_index]], gradient, rate)
 
     def apply_to(self, scene: Scene) -> Scene:
         return with_rows(scene, {view: self.row(view) for view in self.cameras})

@@ -105,9 +105,9 @@ class DistractorsState(ModuleState):
         return {**tables, UPDATES: np.array([[adam.updates["means"]] for adam in self.adams], np.float32)}
 
     def after_render(self, step: TrainingStep) -> None:
-        if step.view is None or step.number <= self.settings.start:
+        if step.view_index is None or step.number <= self.settings.start:
             return
-        camera, gaussians = step.camera, self.adams[self._rows[step.view]].gaussians
+        camera, gaussians = step.camera, self.adams[self._rows[step.view_index]].gaussians
         model = replace(step.model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
         moved_camera = move_camera(self.rasterizer.workspace, camera, np.eye(3, 4))
         frame = self.rasterizer.forward(model, moved_camera, self._black)
@@ -127,9 +127,9 @@ class DistractorsState(ModuleState):
         backpropagate_composite(step.workspace, frame, step.gradient)
 
     def update(self, step: TrainingStep) -> None:
-        if (saved := step.saved_value(self)) and step.view is not None:
+        if (saved := step.saved_value(self)) and step.view_index is not None:
             frame, pixel_sums = saved[1]
-            self.adams[self._rows[step.view]].update(frame.model, frame, pixel_sums, RATES)
+            self.adams[self._rows[step.view_index]].update(frame.model, frame, pixel_sums, RATES)
 
 
 def initial_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint8]]]) -> Tables:

@@ -238,9 +238,9 @@ class Affine(ColorModel):
         if len(image) == 0:
             return IDENTITY
         design = np.column_stack([image, np.ones(len(image))])
-        squares = np.einsum("mi,mj->ij", design, design)  # unlike @, sums do not depend on threads
+        gram = np.einsum("mi,mj->ij", design, design)  # unlike @, sums do not depend on threads
         products = np.einsum("mi,mj->ij", design, photograph)
-        return np.asarray(np.linalg.lstsq(squares, products, rcond=None)[0].T, np.float64)
+        return np.asarray(np.linalg.lstsq(gram, products, rcond=None)[0].T, np.float64)
 
 
 class Exposure(Appearance):
@@ -324,9 +324,9 @@ class ExposureState(ColorState):
         self.table.begin(self.scalars, {view: from_gains(gains) for view, gains in log_gains.items()})
 
     def after_render(self, step: TrainingStep) -> None:
-        if step.view is None:
+        if step.view_index is None:
             return
-        row = self.table.row(self.scalars, self.views[step.view])
+        row = self.table.row(self.scalars, self.views[step.view_index])
         penalty, matrix, image = self.settings.model.penalty(row)[0], self.settings.model.matrix(row), step.image
         step.save(self, (image, matrix, []))
         step.image = transform_colors(step.workspace, step.camera, image, matrix)
@@ -339,9 +339,9 @@ class ExposureState(ColorState):
             downloads.append(download)
 
     def update(self, step: TrainingStep) -> None:
-        if not (saved := step.saved_value(self)) or step.view is None:
+        if not (saved := step.saved_value(self)) or step.view_index is None:
             return
-        self.learn(step.view, saved[2][0](), step.number)
+        self.learn(step.view_index, saved[2][0](), step.number)
 
     def learn(self, view: int, grad_matrix: Floats, step: int) -> None:
         """Update the parameters of a view.  grad_matrix: gradient of the view's matrix, [3, 4]."""

@@ -66,7 +66,7 @@ class Transients(TrainingModule):
     def create_state(self, run: Run) -> ModuleState:
         return TransientsState(self)
 
-    def learn(self, scalars: Scalars, counts: NDArray[np.uint32]) -> None:
+    def update_histogram(self, scalars: Scalars, counts: NDArray[np.uint32]) -> None:
         """Decay the histogram, and add the residual counts of a step, [BINS]."""
         for key, count in zip(KEYS, counts, strict=True):
             scalars[key] = self.decay * scalars.get(key, 0.0) + float(count)
@@ -93,7 +93,7 @@ class TransientsState(ModuleState):
         step.save(self, counts)
 
     def update(self, step: TrainingStep) -> None:
-        self.settings.learn(self.scalars, step.saved_value(self)())
+        self.settings.update_histogram(self.scalars, step.saved_value(self)())
 
 
 def measure_residuals(

@@ -92,12 +92,12 @@ def open_video(path: Path, size: Size, fps: float) -> Iterator[Write]:
     with atomic_path(path, suffix) as temporary:
         with WRITERS[suffix](temporary, size, fps) as write:
 
-            def write_counted(image: Image) -> None:
+            def write_and_count(image: Image) -> None:
                 nonlocal count
                 count += 1
                 write(image)
 
-            yield write_counted
+            yield write_and_count
         if suffix == ".webm":
             fix_track_ids(temporary)
         if (readable_count := count_frames(temporary)) != count:
