@@ -209,7 +209,9 @@ def align(
     gps: Annotated[bool, typer.Option("--gps", help="Use GPS positions in EXIF; coordinates become UTM.")] = False,
     control: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.csv", help="Points marked in photos, with columns point, x, y, z, photo, u, v."),
+        typer.Option(
+            metavar="FILE.csv", help="CSV file of points marked in photos, with columns point, x, y, z, photo, u, v."
+        ),
     ] = None,
     format_: Annotated[
         Literal["colmap", "nerfstudio", "inria"], typer.Option("--format", help="Format of the cameras in a folder.")
@@ -270,7 +272,7 @@ def compress(
         typer.Option(
             min=1,
             metavar="N",
-            help="Training steps after each pruning, and a fifth of them for each palette; default: 1000.",
+            help="Training steps after each pruning; each palette trains for a fifth of them; default: 1000.",
         ),
     ] = None,
     device: DeviceOption = None,
@@ -293,7 +295,7 @@ def lod(
     model: Annotated[Path, typer.Argument(metavar="MODEL|RUN", help="A model file, or a run folder.")],
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to write, with lod-meta.json.")],
     levels: Annotated[int, typer.Option(metavar="N", help="Number of levels, including the model itself.")] = 4,
-    keep: Annotated[float, typer.Option(metavar="F", help="Fraction of the Gaussians of the previous level.")] = 0.5,
+    keep: Annotated[float, typer.Option(metavar="F", help="Size of a level, as a fraction of the previous one.")] = 0.5,
     scene: SceneOption = None,
     steps: Annotated[
         int | None,
@@ -303,7 +305,7 @@ def lod(
     ] = None,
     downscale: Annotated[
         float | None,
-        typer.Option(metavar="N", help="Divisor of the image size for this training; default: the divisor of the run."),
+        typer.Option(metavar="N", help="Divisor of the image size in training; default: the divisor of the run."),
     ] = None,
     device: DeviceOption = None,
 ) -> None:

@@ -336,7 +336,9 @@ def cell(
 @command("cancel", "clsplat cancel runs/store", "clsplat cancel runs/store seed=1")
 def cancel(
     store: Annotated[Path, typer.Argument(metavar="STORE", help="The store of cells.")],
-    cell: Annotated[str | None, typer.Argument(metavar="[CELL]", help="A cell's name or key; default: all.")] = None,
+    cell: Annotated[
+        str | None, typer.Argument(metavar="[CELL]", help="A cell's name or key; default: all cells.")
+    ] = None,
 ) -> None:
     """Ask running cells, on any machine, to save their state and stop."""
     terminal.print_message(f"{store}: stop requested for {commands.cancel(store, cell)}")

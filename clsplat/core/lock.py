@@ -60,8 +60,8 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
     heartbeat = _heartbeat(path)
     if heartbeat is not None and (age := time.time() - heartbeat) < HEARTBEAT_TIMEOUT:
         raise OutputError(
-            f"{in_use_message(folder, owner)}; its heartbeat is {max(0, age):.0f} s old; "
-            f"if that process has exited, wait a minute or remove {path}"
+            f"{in_use_message(folder, owner)}; the last heartbeat of that process is {max(0, age):.0f} s old; "
+            f"if it has exited, wait a minute or remove {path}"
         )
     return owner
 
@@ -83,7 +83,10 @@ def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[
                 return read_owner(file)
             if not is_logged:
                 is_logged = True
-                LOG.info("%s: was recently in use on another machine; waiting up to a minute for its heartbeat", folder)
+                LOG.info(
+                    "%s: was recently in use on another machine; waiting up to a minute for a heartbeat from there",
+                    folder,
+                )
         time.sleep(1)
 
 

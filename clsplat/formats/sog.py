@@ -272,7 +272,7 @@ class _Sog:
         images = self.images[name]
         if index >= len(images):
             raise DataError(
-                f"{self.path}: {name} names {len(images)} files; expected at least {index + 1}; export it again"
+                f"{self.path}: {name} lists {len(images)} files; expected at least {index + 1}; export it again"
             )
         label, limit = f"image {index} of {name}", SLACK + 4 * self.count
         return packing.decode_webp(self.path, label, images[index], self.count, limit)[: self.count]

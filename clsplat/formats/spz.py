@@ -178,7 +178,9 @@ def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) 
     target_bits = min((FINE_FRACTION if is_fine else FRACTION) + extra_bits, MAX_FRACTION)
     bits = min(target_bits, math.floor(math.log2(MAX_INT24 / max(max_value, 1e-9))))
     if bits < 0:
-        raise DataError(f"{path}: SPZ stores positions up to {MAX_INT24}, but the model reaches {max_value:g}; crop it")
+        raise DataError(
+            f"{path}: SPZ stores positions up to {MAX_INT24}, but the model reaches {max_value:g}; crop the model"
+        )
     if bits < min(FRACTION + extra_bits, MAX_FRACTION):
         LOG.warning(
             "%s: because of its largest coordinate, %g, SPZ rounds all positions to %.3g instead of %.3g scene units; "
@@ -386,7 +388,9 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     def read(size: int) -> bytes:
         if len(part := stream.read(size)) < size:
             expected = HEADER + sum(header.sizes)
-            raise DataError(f"{path}: too short: {header.count} splats take {expected} bytes; copy or export it again")
+            raise DataError(
+                f"{path}: is too short for {header.count} splats, which take {expected} bytes; copy or export it again"
+            )
         return part
 
     parameters = unpack_planes(header, [read] * len(header.sizes))
@@ -456,8 +460,8 @@ def _decode_version_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, s
         length, unpacked_size = struct.unpack_from("<2Q", data, table_start + 16 * index)
         if unpacked_size != size or length > len(data) - start:
             raise DataError(
-                f"{path}: stream {index} declares {length} bytes that decompress to {unpacked_size}; expected {size} "
-                f"for {header.count} splats, inside the file; copy or export it again"
+                f"{path}: declares {length} bytes for stream {index}, and {unpacked_size} after decompression; "
+                f"expected {size} decompressed bytes for {header.count} splats, in the file; copy or export it again"
             )
         frames.append(ZstdFrame(path, data[start : start + length], size))
         start += length

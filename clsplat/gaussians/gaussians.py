@@ -174,7 +174,7 @@ class Gaussians:
         """
         table, rows = self._current_table(name), check_rows(rows, self.count)
         if values.shape != (len(rows), table.components):
-            raise ValueError(f"{name}: expected {(len(rows), table.components)}, got {values.shape}")
+            raise ValueError(f"{name}: expected the shape {(len(rows), table.components)}, got {values.shape}")
         if self.on_host and name in self.on_host:
             self.on_host.set_rows(name, rows, values)
             return

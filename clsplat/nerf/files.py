@@ -71,7 +71,7 @@ class FieldModel:
         if np.array_equal(self.origin, origin):
             return self
         raise DataError(
-            f"the field has the origin {self.origin}, the scene has {origin}; use the scene it was trained on"
+            f"the field has the origin {self.origin}, but the scene has {origin}; use the scene it was trained on"
         )
 
     def upload(self, device: Device) -> Field:

@@ -326,7 +326,9 @@ def open_device(device: str | Device | None = None, schedule: Schedule = "auto")
     if not isinstance(device, Device):
         raise ConfigError(f"device: expected part of a device name, or a Device, got {type(device).__name__}")
     if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:
-        raise ConfigError(f"device: {device.text}; the settings need {schedule}: open it with schedule='{schedule}'")
+        raise ConfigError(
+            f"device: is open as {device.text}; the settings need {schedule}: open it with schedule='{schedule}'"
+        )
     return device
 
 

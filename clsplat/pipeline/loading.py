@@ -332,4 +332,4 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
             available_items.update(output for inner in stage.active_stages(step) for output in inner.makes)
             step += stage.steps
     if file := find_output_conflict(settings.stages):
-        raise ConfigError(f"{path}: two stages write '{file}'; give one of them another name")
+        raise ConfigError(f"{path}: two stages write '{file}'; change the file name in one of them")

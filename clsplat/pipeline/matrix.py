@@ -74,12 +74,17 @@ class Matrix(Settings):
 
     @model_validator(mode="after")
     def _check_axes(self) -> "Matrix":
-        axes: list[list[Any]] = [self.pipelines, self.scenes, self.seeds, *self.set.values()]
-        if not any(axes):
-            raise ValueError("expected one of pipelines, scenes, seeds, and set")
-        for axis in axes:
+        axes: dict[str, list[Any]] = {
+            "pipelines": self.pipelines,
+            "scenes": self.scenes,
+            "seeds": self.seeds,
+            **self.set,
+        }
+        if not any(axes.values()):
+            raise ValueError("expected at least one of pipelines, scenes, seeds, and set")
+        for key, axis in axes.items():
             if len({json.dumps(value) for value in axis}) < len(axis):
-                raise ValueError(f"duplicate value in {quote(axis)}")
+                raise ValueError(f"duplicate value in {quote(axis)} of '{key}'")
         return self
 
 

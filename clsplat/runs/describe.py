@@ -94,7 +94,10 @@ def _expect_measures(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures
 def check_unused(out: Path) -> None:
     """Raise OutputError if a run is using `out`.  Log a line if a new run would have to wait for a heartbeat."""
     if not lock.check_free(out):
-        LOG.info("%s: was recently in use on another machine; the run would wait up to a minute for its heartbeat", out)
+        LOG.info(
+            "%s: was recently in use on another machine; the run would wait up to a minute for a heartbeat from there",
+            out,
+        )
 
 
 def _describe_offloading(pipeline: Pipeline, run: Run) -> list[str]:

@@ -83,7 +83,12 @@ class RunScene:
         require_decodable(scene.path, files)
         if blank := require_content(scene.path, original.split("train"), files):
             count = pluralize(len(blank), "photo")
-            LOG.warning("%s: %s: black, of a single color, or transparent: %s", scene.path, count, first_few(blank))
+            LOG.warning(
+                "%s: found %s without content (black, of a single color, or transparent): %s",
+                scene.path,
+                count,
+                first_few(blank),
+            )
         return cls(original, downscaled_scene, background, Identity.from_scene(original, files))
 
 

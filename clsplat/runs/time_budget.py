@@ -236,6 +236,6 @@ def _require_single_training(pipeline: Pipeline) -> None:
 
 def _too_short_error(minutes: float, pipeline: Pipeline) -> ConfigError:
     return ConfigError(
-        f"--minutes {minutes:g}: too short: at least {min_training_steps(pipeline)} steps must fit on this device; "
+        f"--minutes {minutes:g}: too short for the minimum of {min_training_steps(pipeline)} steps on this device; "
         "use more minutes, or smaller images (--set scene.downscale=2)"
     )

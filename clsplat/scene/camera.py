@@ -281,7 +281,8 @@ class Lens:
         if side > MAX_GROWTH * long_side or long_side > MAX_SOURCE:
             raise DataError(
                 f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._intrinsics[:2]}; "
-                f"expected at most {MAX_SOURCE} px per side and focal lengths that match: calibrate the camera again"
+                f"expected at most {MAX_SOURCE} px per side and focal lengths up to "
+                f"{MAX_GROWTH / 2 / FACE_TANGENT:.2g} times the long side: calibrate the camera again"
             )
         if not self._visible_grid.any():
             raise self._error("has no visible pixels")

@@ -68,7 +68,9 @@ class MarkedPoint:
         rays = [_ray(view, pixel) for view, pixel in zip(views, pixels, strict=True)]
         directions = np.stack([direction for _, direction in rays])
         if not (directions @ directions.T).min() <= math.cos(MIN_ANGLE):
-            raise DataError(f"point {quote(self.name)}: its photos are too close together; mark it in another photo")
+            raise DataError(
+                f"point {quote(self.name)}: its photos show it from almost the same direction; mark it in another photo"
+            )
 
         def errors(position: Floats) -> Floats:
             offsets = np.concatenate([project_points(view, position[None]) for view in views]) - pixels
@@ -109,7 +111,8 @@ def find_view(scene: Scene, photo: str) -> View:
             return views[0]
     matches = difflib.get_close_matches(photo, [view.name for view in scene.views], n=1)
     hint = f"; did you mean {quote(matches[0])}?" if matches else "; use a name from the dataset"
-    raise DataError(f"no photo, or more than one, is named {quote(photo)}{hint}")
+    fault = f"{len(views)} photos are" if views else "no photo is"
+    raise DataError(f"{fault} named {quote(photo)}{hint}")
 
 
 def _ray(view: View, pixel: Floats) -> tuple[Floats, Floats]:

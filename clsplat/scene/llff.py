@@ -41,7 +41,9 @@ class LlffReader(Reader):
                 "expected one pose per image, by name: add the missing images or remove the extra ones"
             )
         views = [view_from_row(file, row, image) for row, image in zip(rows, images, strict=True)]
-        logger.info("%s: one focal length per image and no distortion; the photos must be undistorted", file)
+        logger.info(
+            "%s: LLFF stores one focal length per image and no distortion; the photos must be undistorted", file
+        )
         return make_scene(path, views, every_nth([view.name for view in views], holdout), None)
 
     def list_parts(self, parts: Parts) -> None:

@@ -107,7 +107,7 @@ def _frames(path: Path) -> dict[str, list[Path]]:
             "number of frames from every camera: trim the videos to the same start and end, and use the same frame rate"
         )
     if counts[short] < 2:
-        raise DataError(f"{path / VIDEOS}: has one frame per camera; expected two or more, in order of name")
+        raise DataError(f"{path / VIDEOS}: has one frame per camera; expected at least two")
     return frames
 
 
@@ -138,7 +138,7 @@ def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, 
     if missing_names := sorted(set(frames) - set(cameras)):
         raise DataError(
             f"{path}: {len(missing_names)} of {len(frames)} cameras have no pose: {first_few(missing_names)}; "
-            f"expected an image NAME.png of each camera among the poses, or remove {VIDEOS}/{missing_names[0]}"
+            f"expected a pose of the image NAME.png for each camera; add it, or remove {VIDEOS}/{missing_names[0]}"
         )
     if len(views) > len(cameras):
         LOG.info("%s: skipped %d images of cameras without frames in %s", path, len(views) - len(cameras), VIDEOS)

@@ -91,7 +91,10 @@ def with_masks(scene: Scene, folder: Path | None) -> Scene:
     if missing_names:
         photos = f"{count - len(missing_names)} of {pluralize(count, 'photo')}"
         LOG.warning(
-            "%s: contains masks for %s; all pixels of others, such as %s, are used", folder, photos, missing_names[0]
+            "%s: contains masks for %s; all pixels of the other photos, such as %s, are used",
+            folder,
+            photos,
+            missing_names[0],
         )
     return _without_hidden_faces(replace(scene, views=views))
 

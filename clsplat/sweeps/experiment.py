@@ -212,7 +212,7 @@ class Job:
             else:
                 _require_same_photos(self.work, self.out)
                 LOG.info(
-                    "%s: up to date: its outputs are complete; change a setting or the folder to run again", self.out
+                    "%s: the outputs are complete and up to date; change a setting or the folder to run again", self.out
                 )
 
 

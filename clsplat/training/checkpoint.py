@@ -466,12 +466,16 @@ def _record_changes(run: Run, path: Path, state: State) -> list[str]:
         if difference.kind is None:
             raise ConfigError(f"{path} was saved with other settings: {difference}; {remedy}")
         if difference.stage is not None and difference.stage < state.stage_index:
-            raise ConfigError(f"{path} was saved at step {state.step}, after that stage: {difference}; {remedy}")
+            raise ConfigError(
+                f"{path} was saved at step {state.step}, after the stage that has changed: {difference}; {remedy}"
+            )
         if state.best and state.best.refit == "begun" and difference.key_path.endswith((".steps", ".patience")):
-            raise ConfigError(f"{path} is from a refit, whose steps were chosen by validation: {difference}; {remedy}")
+            raise ConfigError(
+                f"{path} is from a refit, whose steps were chosen by validation and are fixed: {difference}; {remedy}"
+            )
         is_end = difference.key_path.endswith(".steps")  # an earlier end of the training
         if difference.stage == state.stage_index and state.is_trained(run.pipeline) and not is_end:
-            advice = f"`clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}` trains longer with it"
+            advice = f"to train longer, run `clsplat resume {shell_quote(run.out)} --steps {2 * state.stage_step}`"
             raise ConfigError(f"{path}: no steps are left for the new setting: {difference}; {advice}")
         changes.append(f"step {state.step}: {difference}")
     run.changes = [*state.changes, *changes]

@@ -145,5 +145,7 @@ def _limit_densify(densify: Densify, block: Block) -> Densify:
     if densify.max_gaussians is not None:
         updates["max_gaussians"] = divide(densify.max_gaussians, 1 / block.pairs)
         if min(schedule_values(updates["max_gaussians"])) < 1:
-            raise ConfigError(f"densify.max_gaussians: {block.name} gets no Gaussians; raise it, or use fewer --blocks")
+            raise ConfigError(
+                f"densify.max_gaussians: {block.name} gets no Gaussians; raise the limit, or use fewer --blocks"
+            )
     return densify.model_copy(update=updates)

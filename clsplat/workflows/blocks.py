@@ -122,7 +122,7 @@ class Blocks:
     ) -> None:
         """execution: where blocks are trained; by default one after another in this process."""
         if execution is not None and not execution.has_store:
-            raise ConfigError("--on: blocks need a store; add the key `store`, or use another engine")
+            raise ConfigError("--on: blocks need a store; add the key `store` to that file, or use another engine")
         self.out, self.plan, self.execution = out, plan, execution
         self._device_name = device if isinstance(device, str) else None
         overrides = [f"scene.path={path_setting(photo_folder(scene))}"]

@@ -192,7 +192,8 @@ def _require_same_identity(out: Path, identity: dict[str, Any], record: str, con
         raise ConfigError(f"{out / record}: is not the record of {content}; remove {out}, or use {remedy}")
     changed_keys = [LABELS.get(key, key) for key, value in identity.items() if previous.get(key) != value]
     if changed_keys:
-        raise ConfigError(f"{out}: has {content} that differs in {', '.join(changed_keys)}; remove it, or use {remedy}")
+        changes = ", ".join(changed_keys)
+        raise ConfigError(f"{out}: has {content} with different {changes}; remove the folder, or use {remedy}")
 
 
 def _is_leftover(name: str) -> bool:

@@ -287,7 +287,7 @@ def test_run_silent_for_a_minute_is_taken_over_despite_clocks(ahead, tmp_path, m
     with lock.lock_folder(tmp_path):
         pass
     assert now[-1] == (58 if ahead < 0 else 60)
-    assert "waiting up to a minute for its heartbeat" in caplog.text
+    assert "waiting up to a minute for a heartbeat from there" in caplog.text
 
 
 @pytest.mark.parametrize(

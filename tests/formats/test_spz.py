@@ -88,7 +88,7 @@ def test_positions_get_as_many_bits_as_needed(tmp_path, rng, caplog):
         assert (lost in caplog.text) == bool(warned) == (fraction < 12)
     source.parameters["means"][0] = 8388608.0
     with pytest.raises(
-        DataError, match=r"SPZ stores positions up to 8388607, but the model reaches 8\.38861e\+06; crop it"
+        DataError, match=r"SPZ stores positions up to 8388607, but the model reaches 8\.38861e\+06; crop the model"
     ):
         write(tmp_path / "a.spz", source)
     source = splats(rng, 50)

@@ -98,7 +98,7 @@ def test_complete_finished_run_does_not_change(copy, monkeypatch, caplog):
     written = (copy / "status.json").read_bytes()
     with caplog.at_level("INFO", "clsplat"):
         clsplat.resume(copy)
-    assert f"{copy}: up to date: its outputs are complete" in caplog.text
+    assert f"{copy}: the outputs are complete and up to date" in caplog.text
     assert (copy / "status.json").read_bytes() == written
 
 

@@ -129,7 +129,7 @@ CLASHES = {
 @pytest.mark.parametrize("name", CLASHES)
 def test_two_stages_writing_one_file_are_refused(name, tmp_path):
     stages, clash = CLASHES[name]
-    with pytest.raises(ConfigError, match=f"two stages write '{clash}'; give one of them another name"):
+    with pytest.raises(ConfigError, match=f"two stages write '{clash}'; change the file name in one of them"):
         load(str(pipeline(tmp_path, stages)))
 
 

@@ -51,7 +51,8 @@ def test_fewer_steps_than_trained_are_refused(killed_run, tiny_scene, caplog):
 def test_finished_training_accepts_no_new_values(few_steps, tiny_scene, tmp_path):
     out = shutil.copytree(few_steps, tmp_path / "run")
     before = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
-    words = rf"no steps are left for the new setting: .*rates.quats was .*; `clsplat resume {out} --steps 24` trains"
+    advice = f"to train longer, run `clsplat resume {out} --steps 24`"
+    words = rf"no steps are left for the new setting: .*rates.quats was .*; {advice}"
     with pytest.raises(ConfigError, match=words):
         Job.resume(out, ["optimize.rates.quats=1e-5"]).run()
     assert {file: file.read_bytes() for file in before if file.name != "log.txt"} == {
@@ -71,7 +72,7 @@ def test_finished_stage_keeps_its_settings(killed_run, tiny_scene):
     crafted(
         killed_run / "checkpoints" / "step_000008.npz", lambda notes, arrays: notes.update(stage_index=2, stage_step=0)
     )
-    with pytest.raises(ConfigError, match="was saved at step 8, after that stage"):
+    with pytest.raises(ConfigError, match="was saved at step 8, after the stage that has changed"):
         train(tiny_scene, killed_run, *FEW, "optimize.steps=20", resume=True)
 
 

@@ -152,7 +152,7 @@ def test_too_long_rehearsal_is_shortened(tiny_scene, tmp_path, monkeypatch, few)
 @pytest.mark.slow
 def test_too_few_minutes_are_refused_in_the_rehearsal(tiny_scene, tmp_path, few_steps):
     """A run that is done stays so, and a new one leaves nothing."""
-    told = r"--minutes 1e-06: too short: at least 200 steps must fit on this device; use more minutes"
+    told = r"--minutes 1e-06: too short for the minimum of 200 steps on this device; use more minutes"
     with pytest.raises(ConfigError, match=told):
         clsplat.run("smoke", tiny_scene, tmp_path / "new", minutes=1e-6)
     assert not list(tmp_path.iterdir())

@@ -94,7 +94,10 @@ def test_image_without_a_mask_counts_fully_and_is_named(tiny_scene, tmp_path, ca
     first = read_scene(tiny_scene).views[0].name
     (masks / first).with_suffix(".png").unlink()
     assert load_mask(applied(tiny_scene, masks).views[0]) is None
-    assert f"{masks}: contains masks for 9 of 10 photos; all pixels of others, such as {first}, are used" in caplog.text
+    assert (
+        f"{masks}: contains masks for 9 of 10 photos; all pixels of the other photos, such as {first}, are used"
+        in caplog.text
+    )
 
 
 def test_folder_without_matching_masks_is_refused(tiny_scene, tmp_path):

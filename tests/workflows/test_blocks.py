@@ -338,4 +338,4 @@ def test_command_shows_the_plan(tiny_scene, few_steps, tmp_path):
     assert "estimated time" in result.stdout
     assert all(re.search(r"\d min", line) for line in result.stdout.splitlines() if "%" in line)
     refused = CliRunner().invoke(app, [*arguments, "--plan", "--blocks", "3"])
-    assert "has a scene in blocks that differs in blocks" in str(refused.exception)
+    assert "has a scene in blocks with different blocks" in str(refused.exception)

@@ -192,7 +192,7 @@ def test_interrupted_search_resumes_when_repeated(few_steps, tmp_path, monkeypat
 
 
 def test_another_search_needs_another_folder(searched, few_steps, tmp_path):
-    with pytest.raises(ConfigError, match="a search that differs in steps; remove it, or use another --out"):
+    with pytest.raises(ConfigError, match="a search with different steps; remove the folder, or use another --out"):
         clsplat.compress_model(few_steps, target="1MB", out=searched, keep=KEEP, steps=STEPS + 1)
     (tmp_path / "own.txt").write_text("mine")
     with pytest.raises(ConfigError, match="contains files that are not part of a search"):
@@ -207,7 +207,7 @@ def test_search_does_not_resume_with_other_photographs(few_steps, tiny_scene, tm
         clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
     first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
     second.write_bytes(first.read_bytes())
-    with pytest.raises(ConfigError, match=r"a search that differs in photographs"):
+    with pytest.raises(ConfigError, match=r"a search with different photographs"):
         clsplat.compress_model(few_steps, tmp_path / "scene", **ask)
 
 

@@ -202,7 +202,7 @@ def test_interrupted_training_resumes(few_steps, tmp_path, monkeypatch, trained)
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert not (tmp_path / "site").exists()
     monkeypatch.setattr(runner, "run_stages", run_stages)
-    with pytest.raises(ConfigError, match=r"site\.training: has the training of levels that differs in steps"):
+    with pytest.raises(ConfigError, match=r"site\.training: has the training of levels with different steps"):
         clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS + 1)
     clsplat.write_levels(few_steps, tmp_path / "site", levels=3, steps=STEPS)
     assert tree(tmp_path / "site") == tree(trained[0])
@@ -216,7 +216,7 @@ def test_training_does_not_resume_with_other_photographs(few_steps, tiny_scene, 
         clsplat.write_levels(few_steps, **ask)
     first, second, *_ = sorted((tmp_path / "scene" / "train").iterdir())
     second.write_bytes(first.read_bytes())
-    with pytest.raises(ConfigError, match=r"the training of levels that differs in photographs"):
+    with pytest.raises(ConfigError, match=r"the training of levels with different photographs"):
         clsplat.write_levels(few_steps, **ask)
 
 

@@ -387,7 +387,7 @@ def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
         original, background = settings.read(runs[0].photo_folder)
         scene = original.downscaled(settings.downscale)
     except (DataError, ConfigError) as error:
-        LOG.warning("no crops: %s", error)
+        LOG.warning("the page has no crops: %s", error)
         return [], str(error)
     crops = find_crops(runs, scene, background)
     return crops, "" if crops else "no view was rendered by all runs; add `- render` to the stages"

@@ -81,7 +81,9 @@ class BilateralGrid(Appearance):
             raise DataError(f"its grids do not have the shape [photographs, {ENTRIES}, nz, ny, nx]")
         rows, count = sorted(row for key, row in scalars.items() if key.endswith("/row")), len(tables["values"])
         if rows != list(range(count)):
-            raise DataError(f"it has color grids for {count} photos, but scalars for another number of photos")
+            raise DataError(
+                f"it has color grids for {count} photos, but their rows are not numbered from 0 to {count - 1}"
+            )
 
     def rate_schedule(self, steps: int, photographs: int, is_warm_start: bool = True) -> Schedule:
         if self.rate != "auto":
