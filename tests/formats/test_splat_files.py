@@ -127,7 +127,7 @@ DAMAGED = {
     "more splats than places": ({"count": 4}, "4 splats in 3 rows"),
     "degree": ({"degree": 3}, "SH degree 3"),
     "places": ({"rows": 3, "buckets": 10**6}, "truncated"),
-    "empty buckets": ({"held": 2}, "have fewer splats"),
+    "empty buckets": ({"held": 2}, "fewer than the declared"),
     "full buckets": ({"full": 1}, "do not match"),
     "no places": ({"most": 0}, "not a .ksplat"),
 }

@@ -270,7 +270,7 @@ WRONG = {
     "an empty tree": ({"tree": {"children": []}}, "have no file of level 0"),
     "no number": ({"tree": {"lods": {"0": {"file": 0, "offset": "0", "count": 1}}}}, "offset of a leaf is '0'"),
     "a negative number": ({"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": -1}}}}, "count of a leaf is -1"),
-    "beyond its file": ({"tree": {"lods": {"0": {"file": 0, "offset": 10**6, "count": 1}}}}, "which has"),
+    "beyond its file": ({"tree": {"lods": {"0": {"file": 0, "offset": 10**6, "count": 1}}}}, "expected splats from 0"),
     "more than its files hold": (
         {"tree": {"lods": {"0": {"file": 0, "offset": 0, "count": 10**8}}}},
         "declares 100000000 splats, but its files have only",

@@ -267,7 +267,7 @@ def test_schema_has_the_execution_keys():
     ("given", "words"),
     [
         ({"engine": "dask://far:1"}, r"expected tls:// for another machine, or insecure: true \(--insecure\)"),
-        ({"engine": "tls://far:1"}, r"\(--tls-ca, --tls-cert and --tls-key\)"),
+        ({"engine": "tls://far:1"}, r"\(--tls-ca, --tls-cert, and --tls-key\)"),
         ({"engine": "tls://far:1", "tls": {"ca": "a", "key": "b"}}, "^--tls-cert: 'cert' is missing"),
         ({"engine": "tcp://10.0.0.1:8786"}, r"^--scheduler: .*dask://HOST:PORT \(tcp:// in Dask\)"),
     ],
