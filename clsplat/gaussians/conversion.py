@@ -444,7 +444,7 @@ def _require_no_other_frames(folder: Path, pattern: re.Pattern[str], files: Sequ
         all_names = sorted(os.listdir(folder)) if folder.is_dir() else []
     if other_frames := [name for name in all_names if pattern.fullmatch(name) and name not in frame_names]:
         raise ConfigError(
-            f"{folder / other_frames[0]}: has a name like a frame, but is not one of the {len(files):,} frames; rename it"
+            f"{folder / other_frames[0]}: has a frame's name, but is not one of the {len(files):,} frames; rename it"
         )
 
 

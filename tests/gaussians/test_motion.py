@@ -102,7 +102,7 @@ def test_convert_writes_snapshots(tmp_path: Path):
     done = clsplat.convert(source, tmp_path / "frame.spz", frames=2)
     assert [Path(name).name for name in done["files"]] == ["frame_0000.spz", "frame_0001.spz"]
     assert len(clsplat.convert(source, tmp_path / "frames", frames=3)["files"]) == 3  # the same ones again
-    with pytest.raises(ConfigError, match=r"0002\.ply: has a name like a frame, but is not one of the 2 frames"):
+    with pytest.raises(ConfigError, match=r"0002\.ply: has a frame's name, but is not one of the 2 frames"):
         clsplat.convert(source, tmp_path / "frames", frames=2)
     for wrong in ({"time": 2.0}, {"frames": 1}, {"frames": 3, "time": 0.5}):
         with pytest.raises(ConfigError, match=r"expected|cannot be combined"):
