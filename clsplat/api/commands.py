@@ -470,8 +470,8 @@ def convert(
     crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`
     transform: such as "scale=2 rotate=90,0,0" (degrees)
     drop_below: drop Gaussians with a lower opacity
-    filter_floaters: drop Gaussians that are large and faint, isolated, or far outside; needs no photos
-    level: turn the model so that its ground is at y = 0 and up is -y; the ground must be within 45 degrees of that
+    filter_floaters: drop Gaussians that are large and faint, isolated, or far outside the scene; needs no photos
+    level: turn the model so that its ground is at y = 0 and up is -y; the ground must be within 45 degrees of level
     time: write a moving model as a static model at this time, in [0, 1]
     frames: write this number of static files at evenly spaced times: PLY files in the folder `out`, or files named
         `out` with a number added

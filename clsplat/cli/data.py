@@ -76,7 +76,7 @@ def undistort(
     out: Annotated[Path, typer.Argument(help="Folder for the scene with pinhole cameras.")],
     long_side: Annotated[int | None, typer.Option(min=16, help="Maximum size of the long side, pixels.")] = None,
     undefined_pixels: Annotated[
-        UndefinedPixels, typer.Option(help="Crop away pixels that no photo covers, or keep and mask them.")
+        UndefinedPixels, typer.Option(help="Crop away pixels that the original photo does not cover, or mask them.")
     ] = "crop",
 ) -> None:
     """Undistort the photos of a scene, including those of fisheye lenses."""

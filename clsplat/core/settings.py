@@ -101,7 +101,7 @@ def iter_settings(value: Any, path: str = "") -> Iterator[tuple[str, Settings]]:
 def descriptions(kind: type[BaseModel]) -> dict[str, str]:
     """Return the docstrings of a class's fields by name, or nothing if its source cannot be read.
 
-    The source is parsed on demand: parsing all classes would add a third to the time of each start.
+    The source is parsed on demand: parsing all classes would make the start a third slower.
     """
     result: dict[str, str] = {}
     for base in reversed(kind.__mro__):

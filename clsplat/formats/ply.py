@@ -147,8 +147,8 @@ def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
         table = np.loadtxt(lines, header.dtype, comments=None, ndmin=1)
     except (ValueError, OverflowError) as error:
         raise DataError(
-            f"{path}: {shorten(str(error).partition(';')[0], 200)} after the header; expected one number for each "
-            "property: export it again"
+            f"{path}: after the header: {shorten(str(error).partition(';')[0].rstrip('.'), 200)}; expected one "
+            "number for each property: export it again"
         ) from error
     if len(table) < header.count:
         raise DataError(

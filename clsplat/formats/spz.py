@@ -104,7 +104,7 @@ class SpzHeader:
     def parse(cls, path: Path, data: bytes) -> "SpzHeader":
         """Parse the header in the first bytes of a file.  Raises DataError if it is invalid."""
         if len(data) < HEADER or data[:4] != MAGIC:
-            raise DataError(f"{path}: not an SPZ file with a header of {HEADER} bytes; copy or export it again")
+            raise DataError(f"{path}: not an SPZ file, or shorter than its header of {HEADER} bytes; export it again")
         version, count, degree, fraction, flags = struct.unpack_from("<2I3B", data, 4)
         if not 1 <= version <= 4 or degree > MAX_STORED_DEGREE or fraction > 23:
             raise DataError(

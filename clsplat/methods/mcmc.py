@@ -58,8 +58,8 @@ class Relocate(Rule):
 def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:
     """Return the number of times that systematic sampling draws each item, [N]: the expected number rounded down or up.
 
-    The function places `draws` equidistant points, shifted by one random number, on the cumulative weights, in exact
-    integers.
+    With exact integer arithmetic, the function places `draws` equidistant points, shifted by one random number, on the
+    cumulative weights.
     """
     ends = np.cumsum(weights)
     total = int(ends[-1])

@@ -334,7 +334,7 @@ def measure(
 ) -> list[ViewMetrics]:
     """Return the metrics of every view.
 
-    Masked pixels are black in both images; PSNR and SSIM are means over the other pixels.  check_finite: raise
+    Masked pixels are black in both images; PSNR and SSIM are computed over the other pixels.  check_finite: raise
     NumericError for a render that is not finite, instead of counting it as black.  colors: color model for
     `psnr_color`.  progress: the views, wrapped in a progress counter.  train_views: the training views, for metrics by
     timestamp.

@@ -61,7 +61,7 @@ class Plan:
     def bind(self, changes: Mapping[str, Any]) -> None:
         """Set the arguments that changed since the last replay.  Raises KernelError for other names or types."""
         if changes.keys() != self._values.keys():
-            raise KernelError(f"a plan of {', '.join(self._values)} cannot change {', '.join(changes)}")
+            raise KernelError(f"the plan expects values of {', '.join(self._values)}; got {', '.join(changes)}")
         changed_launches = {}
         for name, value in changes.items():
             identity, current = _identity(value), self._values[name]

@@ -97,7 +97,7 @@ def with_steps(settings: PipelineFile, steps: int, done_steps: int) -> PipelineF
 
 
 def last_edit(training: Training) -> int:
-    """Return the last step at which Gaussians are added or the size of photos changes; 0 if no setting limits them.
+    """Return the last step that adds or prunes Gaussians or changes the size of photos; 0 if no setting does.
 
     A shorter training would end with downscaled photos, or before its last pruning.
     """

@@ -132,8 +132,8 @@ class MatchFeatures(Step):
 class MapCameras(Step):
     """Find cameras and points from matches.
 
-    If photographs cannot be placed, the step tries again with looser settings, with more pairs unless
-    `match_features` matched all of them, and with more features.
+    If photographs cannot be placed, the step tries again, in this order: with looser settings, with more pairs (unless
+    `match_features` matched all of them), and with more features.
     """
 
     version: ClassVar[int] = 4  # enlarges small photos if denser features are not enough

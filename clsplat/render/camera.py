@@ -119,7 +119,7 @@ def camera_values(view: View, tile: int) -> NDArray[Any]:
     if tiles_x * tiles_y * tile**2 > PIXELS_MAX:
         raise DataError(
             f"{view.name}: the camera is {camera.width}x{camera.height} pixels; expected at most {PIXELS_MAX:,} "
-            f"in full tiles of {tile}x{tile} pixels; downscale the image"
+            f"after rounding each side up to a multiple of {tile}; downscale the image"
         )
     margin_x = RAY_MARGIN * camera.width / (2 * camera.fx)
     margin_y = RAY_MARGIN * camera.height / (2 * camera.fy)

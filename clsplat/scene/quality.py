@@ -91,7 +91,7 @@ def sharpness(gray: NDArray[np.uint8]) -> float:
 
 
 def sharpness_values(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return two values, [2]: the sharpness of a gray image, [H, W], and the sharpness divided by its squared mean.
+    """Return the sharpness of a gray image, [H, W], and the sharpness divided by the squared mean gray value, [2].
 
     The second value does not depend on the brightness.
     """

@@ -280,7 +280,7 @@ def read_pose(frame: JsonFrame) -> Floats:
         matrix[:3, :3] /= np.cbrt(max(np.linalg.det(matrix[:3, :3]), MIN_SCALE**3))  # some exporters keep a scale
     if not is_finite or not _is_rotation(matrix[:3, :3]):
         raise DataError(
-            f"{frame.source}: transform_matrix is not a 4x4 matrix with a rotation in its top left corner; "
+            f"{frame.source}: transform_matrix is not a 4x4 matrix whose upper-left 3x3 block is a rotation; "
             "remove that frame or export the file again"
         )
     camera_to_world = np.eye(4)

@@ -101,7 +101,7 @@ class View:
         right = np.cross(forward, up_vector)
         axes = np.stack([right, np.cross(forward, right), forward])
         if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up_vector):
-            raise ValueError(f"{quote(name)}: expected a target away from the position and not along `up`")
+            raise ValueError(f"{quote(name)}: expected a target other than the position, not in the direction of `up`")
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
         return cls(name, camera, np.column_stack([axes, -axes @ center]))
 

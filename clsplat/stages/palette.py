@@ -74,7 +74,7 @@ class PaletteSh(Scheduled):
         if run.adam is not None:
             run.adam.reset_moments("sh_rest")
         vectors = pluralize(len(harmonics.palette), "vector")
-        LOG.info("wrote a palette of %s for %s", vectors, pluralize(gaussians.count, "Gaussian"))
+        LOG.info("built a palette of %s for %s", vectors, pluralize(gaussians.count, "Gaussian"))
 
 
 class SharePalette(Scheduled):

@@ -91,7 +91,7 @@ def _validate_members(archive: zipfile.ZipFile, size: int) -> None:
     if any(member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1 for member in members):
         raise DataError("its contents are compressed or encrypted")
     if sum(max(member.file_size, member.compress_size) for member in members) > size:
-        raise DataError(f"it declares more bytes than the {size} of the file")
+        raise DataError(f"it declares more bytes than the file has ({size})")
 
 
 def _read_metadata(archive: zipfile.ZipFile) -> Metadata:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
+from clsplat.core.errors import ConfigError, DataError, MemoryLimitError, shell_quote
 from clsplat.core.files import check_not_run_file
 from clsplat.core.machine import available_memory
 from clsplat.core.progress import counted
@@ -132,7 +132,8 @@ def write_mesh(
     check_not_run_file(out)
     photo_model = ModelFile(model, scene, device, downscale)
     if is_moving(photo_model.gaussians):
-        raise DataError(f"{model}: moves; write one of its times first: `clsplat convert {model} OUT.ply --time T`")
+        command = f"`clsplat convert {shell_quote(model)} OUT.ply --time T`"
+        raise DataError(f"{model}: moves; write one of its times first: {command}")
     views = photo_model.scene.split("train") or photo_model.scene.views
     source = DepthSource(Canvas(photo_model.painter), views)
     pixel = source.pixel_size()

@@ -111,8 +111,8 @@ def test_view_looking_at_a_point_centers_it_with_up_upwards(rng):
 @pytest.mark.parametrize(
     ("place", "message"),
     [
-        (([1, 2, 3], [1, 2, 3], [0, 0, 1]), "expected a target away from the position"),
-        (([0, 0, 0], [0, 0, 5], [0, 0, 1]), "and not along `up`"),
+        (([1, 2, 3], [1, 2, 3], [0, 0, 1]), "expected a target other than the position"),
+        (([0, 0, 0], [0, 0, 5], [0, 0, 1]), "not in the direction of `up`"),
         (([0, 0], [0, 0, 5], [0, 1, 0]), "of 3 numbers each"),
     ],
 )

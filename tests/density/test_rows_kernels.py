@@ -52,7 +52,7 @@ def test_setting_rows_leaves_other_rows(device, rng, count, name):
 @on_one_setting
 def test_rows_of_another_shape_are_refused(device, rng):
     gaussians = gaussians_of(device, rng)
-    with pytest.raises(ValueError, match=r"means: expected \(2, 3\), got \(2, 4\)"):
+    with pytest.raises(ValueError, match=r"means: expected the shape \(2, 3\), got \(2, 4\)"):
         gaussians.set_rows("means", np.arange(2), np.zeros((2, 4)))
 
 

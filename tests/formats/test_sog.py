@@ -221,7 +221,7 @@ REFUSED = {
     "version": ({"version": 3}, "version 3; expected 1 or 2"),
     "path": ({"means__files": ["../means_l.webp", "x"]}, "the name of a file in the same folder"),
     "names": ({"means__files": 3}, "expected one or two file names"),
-    "one file": ({"means__files": ["means_l.webp"]}, "names 1 files"),
+    "one file": ({"means__files": ["means_l.webp"]}, "lists 1 files"),
     "missing": ({"quats__files": ["other.webp"]}, "cannot be read"),
     "codebook": ({"scales__codebook": [1.0] * 255}, "expected 256 numbers"),
     "text": ({"sh0__codebook": ["x"] * 256}, "expected 256 numbers"),

@@ -254,7 +254,7 @@ REFUSED = {
     "checksum of bytes": (b"\x1f\x8b\x08\0\0\0\0\0\0\xff\xff\xff\xff", "in gzip"),
     "plain and short": (legacy(3)[:-1], "more than it can contain|too short"),
     "plain and long": (legacy(2) + b"a", "has data after its 2 splats"),
-    "header": (b"NGSP\4\0\0\0", "with a header of 16 bytes"),
+    "header": (b"NGSP\4\0\0\0", "shorter than its header of 16 bytes"),
 }
 
 
@@ -274,7 +274,7 @@ def test_streams_of_wrong_sizes_are_refused(tmp_path, rng):
         "has data after its last stream": data + b"x",
         "has 5 streams": data[:15] + b"\5" + data[16:],
         "table at byte 4294967295": data[:16] + b"\xff" * 4 + data[20:],
-        "expected 360 for 40 splats": data[:40] + struct.pack("<Q", table[1] + 1) + data[48:],
+        "expected 360 decompressed bytes for 40 splats": data[:40] + struct.pack("<Q", table[1] + 1) + data[48:],
         f"declares {2**40} bytes": data[:32] + struct.pack("<Q", 2**40) + data[40:],
         "a stream is damaged": data[:128] + bytes(8) + data[136:],
     }

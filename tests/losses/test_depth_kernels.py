@@ -115,12 +115,12 @@ def depths_of_means(device: Device, trainer, photograph, count: int = 30) -> Poi
 def test_points_with_more_observations_weigh_more(device, rng):
     trainer, photograph = trainer_of(device, rng, [L1()])
     result = depths_of_means(device, trainer, photograph)
-    camera = replace(photograph.camera, view=0)
+    camera = replace(photograph.camera, view_index=0)
     here = result.at(camera)
     assert here is not None
     assert here is result.at(camera), "kept"
     assert set(np.unique(here.weights.get())) == {0.25, 0.75}
-    assert result.at(replace(camera, view=1)) is None, "a view without points"
+    assert result.at(replace(camera, view_index=1)) is None, "a view without points"
     assert result.at(photograph.camera) is None, "a view that is not trained on"
 
 
@@ -132,7 +132,7 @@ def test_training_with_the_loss_approaches_known_depths(device, rng):
         local = np.random.default_rng(3)
         trainer, photograph = trainer_of(device, local, [L1(weight=0.0), InverseDepth(weight=weight)])
         trainer.modules = [DepthSupervisionState(depths_of_means(device, trainer, photograph))]
-        photograph = replace(photograph, camera=replace(photograph.camera, view=0), mask=None)
+        photograph = replace(photograph, camera=replace(photograph.camera, view_index=0), mask=None)
         measured = replace(trainer, losses=[L1(weight=0.0), InverseDepth(weight=1.0)])
         for step in range(1, 60):
             trainer.step(photograph, step)

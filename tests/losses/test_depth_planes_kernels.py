@@ -38,7 +38,7 @@ def error_after(device, weight: float) -> float:
     photographs = []
     for number in range(len(NAMES)):
         pose = np.column_stack([np.eye(3), [0.3 * number - 0.3, 0, 0]]).astype(np.float32)
-        camera = replace(upload_camera(device, replace(case.view, world_to_camera=pose)), view=number)
+        camera = replace(upload_camera(device, replace(case.view, world_to_camera=pose)), view_index=number)
         values = np.clip(render_floats(SplatPainter(rasterizer, model, black), camera), 0, 1)
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
         photographs.append(Photograph(camera, device.upload(pixels)))

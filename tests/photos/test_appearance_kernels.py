@@ -45,7 +45,7 @@ class Case:
         case, self.scalars = random_case(rng, 40, 50, 36), {}
         model, pixels = case.model(device), rng.integers(0, 256, (3, 36, 50)).astype(np.uint8)
         mask = None if share is None else device.upload((rng.random((1, 36, 50)) < share).astype(np.uint8))
-        camera = replace(case.device_camera(device), view=1)
+        camera = replace(case.device_camera(device), view_index=1)
         self.photograph = Photograph(camera, device.upload(pixels), mask)
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         self.trainer = StepTrainer(*parts, device.upload(BACKGROUND), losses, Rates())

@@ -55,7 +55,7 @@ class Capture:
             shown = self.rendered(camera)
             values = np.clip(shown * np.exp(gains + (local(shown, number) if local else 0)), 0, 1)
             pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
-            self.photographs.append(Photograph(replace(camera, view=number), device.upload(pixels)))
+            self.photographs.append(Photograph(replace(camera, view_index=number), device.upload(pixels)))
 
     def rendered(self, camera: DeviceCamera) -> np.ndarray:
         """The uncorrected colors of the model, [H, W, 3]."""

@@ -93,7 +93,7 @@ def test_depths_match_the_ground_truth(device, yard, tmp_path):
     depths = PointDepths(device, tracks, names, 1.0, DepthMaps(tmp_path / "maps"))
     for number, view in enumerate(yard.views[:3]):
         camera = upload_camera(device, view)
-        known = depths.at(type(camera)(**{**vars(camera), "view": number}))
+        known = depths.at(type(camera)(**{**vars(camera), "view_index": number}))
         assert known is not None
         places, inverse = known.pixels.get(), known.inverse.get()
         rows, columns = places // camera.stride, places % camera.stride

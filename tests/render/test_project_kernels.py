@@ -50,7 +50,7 @@ def test_other_renders_omit_nothing(device, rng):
     expected = rasterizer.forward(model, camera, device.zeros(3)).image.get().copy()
     hide(model.gaussians, np.ones((3, 40), bool))
     np.testing.assert_array_equal(rasterizer.forward(model, camera, device.zeros(3)).image.get(), expected)
-    nothing = rasterizer.forward(model, replace(camera, view=1), device.zeros(3)).image.get()
+    nothing = rasterizer.forward(model, replace(camera, view_index=1), device.zeros(3)).image.get()
     assert expected.any()
     assert not nothing.any()
 
@@ -59,7 +59,7 @@ def test_other_renders_omit_nothing(device, rng):
 def test_bands_omit_the_same_gaussians(device, rng):
     """A frame in several bands is projected again by the backward pass."""
     case = random_case(rng, 60, 70, 50)
-    model, camera = case.model(device), replace(case.device_camera(device), view=1)
+    model, camera = case.model(device), replace(case.device_camera(device), view_index=1)
     hide(model.gaussians, rng.random((2, 60)) < 0.5)
     sums = []
     for budget in (None, RenderLimits(40)):

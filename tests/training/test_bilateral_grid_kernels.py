@@ -67,7 +67,7 @@ class Case:
         case, self.scalars = random_case(rng, 40, WIDTH, HEIGHT), {}
         model, pixels = case.model(device), rng.integers(0, 256, (3, HEIGHT, WIDTH)).astype(np.uint8)
         mask = None if share is None else device.upload((rng.random((1, HEIGHT, WIDTH)) < share).astype(np.uint8))
-        self.photograph = Photograph(replace(case.device_camera(device), view=1), device.upload(pixels), mask)
+        self.photograph = Photograph(replace(case.device_camera(device), view_index=1), device.upload(pixels), mask)
         parts = Rasterizer(device), model, Adam(model.gaussians), SplatStats(model.gaussians, [])
         behind = device.upload(np.array([0.2, 0.5, 0.9], np.float32))
         self.trainer = StepTrainer(*parts, behind, (L2(),), Rates())

@@ -42,7 +42,7 @@ class Pair:
         self.black = device.zeros(3)
 
     def camera(self, number):
-        return replace(self.case.device_camera(self.device), view=number)
+        return replace(self.case.device_camera(self.device), view_index=number)
 
     def layer(self, number, at=1):
         """The step with what the photograph has in front of it."""

@@ -26,7 +26,7 @@ class Case:
         clsplat.load_plugin(EXAMPLE)
         kind = variants(TrainingModule)["lens_and_curves"]
         self.trainer, photograph = trainer_of(device, rng, [L2()])
-        self.photograph = replace(photograph, camera=replace(photograph.camera, view=0))
+        self.photograph = replace(photograph, camera=replace(photograph.camera, view_index=0))
         self.example, view = sys.modules[kind.__module__], SimpleNamespace(name="a")
         run = SimpleNamespace(
             scene=SimpleNamespace(split=lambda name: [view]), original=SimpleNamespace(cameras={"a": "b"})

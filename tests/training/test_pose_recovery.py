@@ -67,7 +67,7 @@ def pose_errors(
     for number, (view, given) in enumerate(zip(truth, views, strict=True)):
         values = np.clip(render_floats(SplatPainter(rasterizer, model, background), upload_camera(device, view)), 0, 1)
         pixels = np.ascontiguousarray(np.rint(255 * values).astype(np.uint8).transpose(2, 0, 1))
-        photographs.append(Photograph(replace(upload_camera(device, given), view=number), device.upload(pixels)))
+        photographs.append(Photograph(replace(upload_camera(device, given), view_index=number), device.upload(pixels)))
     rate = Decay(initial=2e-3, final=2e-5, over=STEPS)
     settings = CameraOptimizer(start=0, rotation=rate, translation=rate, focal="auto")
     poses = CameraState(settings, views, views)

@@ -86,7 +86,7 @@ def test_ellipse_of_one_sided_cameras_swings_on_their_side(rng):
 def test_orbit_reports_unseen_directions(rng, caplog):
     with caplog.at_level(logging.WARNING, "clsplat"):
         PATHS["orbit"](rig_of(ring(np.linspace(-0.8, 0.8, 15)), rng), 4, SIZE)
-    assert "degrees of the orbit were not photographed" in caplog.text
+    assert "degrees of the orbit; the path" in caplog.text
 
 
 def test_outward_facing_cameras_have_no_orbit(rng):

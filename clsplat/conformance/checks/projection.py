@@ -267,7 +267,7 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Res
 
 @CHECKS.add("project_backward")
 def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
-    """Compare the gradients of long splats in a blended image.  In less stable formulas, terms cancel."""
+    """Compare the gradients of long splats in a blended image.  Unstable formulas lose most digits there."""
     for aspect in ASPECTS:
         for name, settings in LONG_FILTERS.items():
             case = needle_case(rng, 12, aspect, **settings)

@@ -122,7 +122,7 @@ class ModuleState:
 
     # outside steps
     def attach_to(self, model: DeviceModel) -> None:
-        """Attach objects to a model, such as a sky, that are rendered together with its Gaussians."""
+        """Attach objects, such as a sky, to a model, to be rendered together with its Gaussians."""
 
     def finish(self, run: Run) -> None:
         """Called after the last training step, before the best model replaces the model of that step."""

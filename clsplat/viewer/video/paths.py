@@ -305,7 +305,7 @@ def orbit(rig: Rig, frames: int, size: Size) -> list[View]:
     camera_angles = np.arctan2(offsets[:, 1], offsets[:, 0])
     if (gap := _widest_gap(camera_angles)[0]) > MAX_GAP:
         LOG.warning(
-            "%.0f degrees of the orbit were not photographed; the path `ellipse` stays where photos were taken",
+            "no photos were taken along %.0f degrees of the orbit; the path `ellipse` stays where photos were taken",
             math.degrees(gap),
         )
     angles = camera_angles[0] + 2 * np.pi * np.arange(frames) / frames
