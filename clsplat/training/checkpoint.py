@@ -126,7 +126,7 @@ MODULES = "modules/"  # prefix of module names, which are prefixes of table name
 
 
 def module_tables(run: Run, full: bool = True) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    """Yield the tables of a run's modules with their keys in the file.  full: also those that only training needs."""
+    """Yield the tables of a run's modules with their keys in the file.  full: also tables that only training needs."""
     for module, state in run.modules.items():
         if full or state.after_training != "dropped":
             yield from ((f"{MODULES}{module}/{name}", table) for name, table in state.tables(full).items())

@@ -8,6 +8,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,8 @@ class MeshOptions:
             raise ConfigError(f"--voxel {self.voxel:g}: expected a length above 0, in scene units")
         if not 0 < self.keep <= 1:
             raise ConfigError(f"--keep {self.keep:g}: expected a fraction of the faces above 0, up to 1")
+        if self.keep < 1 and find_spec("fast_simplification") is None:  # before minutes of work
+            raise ConfigError("--keep needs fast-simplification; in a checkout, pip install '.[mesh]'")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from clsplat.core.errors import ConfigError
 from clsplat.core.progress import counted
 from clsplat.formats.mesh import Floats, Mesh
 from clsplat.render.fusion import SIDE, DistanceField
@@ -159,15 +158,12 @@ def smooth(mesh: Mesh) -> Mesh:
 def reduce(mesh: Mesh, keep: float) -> Mesh:
     """Reduce a mesh to a fraction of its faces with quadric error metrics (Garland & Heckbert 1997).
 
-    A closed surface stays closed, even if more faces must be kept.  Raises ConfigError if the package
-    fast-simplification is not installed.
+    A closed surface stays closed, even if more faces must be kept.  Requires the package fast-simplification.
     """
     if keep >= 1 or len(mesh.faces) < MIN_REDUCED:
         return mesh
-    try:
-        import fast_simplification  # optional
-    except ImportError:
-        raise ConfigError(f"--keep {keep:g} needs fast-simplification: pip install 'clsplat[mesh]'") from None
+    import fast_simplification  # optional
+
     points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, 1 - keep)
     points = np.asarray(points, np.float64)
     colors = mesh.colors[cKDTree(mesh.vertices).query(points)[1]]

@@ -185,6 +185,9 @@ def test_invalid_input_is_refused(few_steps, tiny_scene, tmp_path, monkeypatch):
     for options, words in (({"voxel": 0.0}, "--voxel 0: expected"), ({"keep": 1.5}, "--keep 1.5: expected")):
         with pytest.raises(ConfigError, match=words):
             clsplat.write_mesh(few_steps, tmp_path / "a.ply", **options)
+    monkeypatch.setattr(workflow, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="--keep needs fast-simplification"):
+        clsplat.write_mesh(few_steps, tmp_path / "a.ply", keep=0.5)
     with pytest.raises(ConfigError, match=r"expected a name that ends in .ply, .obj, .glb"):
         clsplat.write_mesh(few_steps, tmp_path / "a.stl")
     with pytest.raises(ConfigError, match="is a file of a run"):
