@@ -30,7 +30,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
 Color = float | Sequence[float]
 _OPEN_LOCK = threading.Lock()
-GEOMETRY = 6  # the first pixel sums are for the geometry, the others for the color (cl_kernels/splat.h)
+GEOMETRY = 6  # number of pixel sums for the geometry; those for the color follow (cl_kernels/splat.h)
 
 
 def open_checked(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
@@ -63,8 +63,8 @@ class Gradients:
     sh_base: Floats
     sh_rest: Floats
     mean2d: Floats  # [N, 2] px⁻¹, with respect to the projected mean
-    rotation: NDArray[np.float64]  # [3] rad⁻¹, of the camera: its axes p become exp([rotation]x) p + translation
-    translation: NDArray[np.float64]  # [3] 1 / scene units, in the axes of the camera
+    rotation: NDArray[np.float64]  # [3] rad⁻¹; camera coordinates p become exp([rotation]x) p + translation
+    translation: NDArray[np.float64]  # [3] 1 / scene units, in camera axes
     log_focal: float  # with respect to the logarithm of a factor on both focal lengths
     motion: Floats | None = None  # [N, 5 or more] if the Gaussians move
 
@@ -79,7 +79,7 @@ class RenderResult:
     image: Floats  # [height, width, 3], over the background
     alpha: Floats  # [height, width] in [0, 1], opacity of each pixel
     depth: Floats | None  # [height, width] scene units, mean depth of each pixel; 0 where alpha is 0
-    median_depth: Floats | None  # [height, width] scene units, where transmittance falls below ½; 0: nowhere
+    median_depth: Floats | None  # [height, width] scene units, where transmittance falls below ½; 0 if it does not
     view: View
     background: Floats  # [3]
     model: DeviceModel  # the rendered model, which stays on the device as long as this result
@@ -204,14 +204,19 @@ class Renderer:
         gradients = self.rasterizer.gradients(model, frame, pixel_sums)
         arrays = {**{name: gradients[name] for name in model.gaussians.trained}, "mean2d": gradients.mean2d}
         tables = {name: np.ascontiguousarray(a.get()[:, :count].T) for name, a in arrays.items()}
-        shift, turn, focal = np.split(pose_sums() if count else np.zeros(7), [3, 6])  # of the Gaussians, in world axes
+        grad_shift, grad_rotation, grad_focal = np.split(pose_sums() if count else np.zeros(7), [3, 6])  # in world axes
         if depth is not None:
             grad_mean = grad_depth[:, None] * pose[2, :3]
             tables["means"] += grad_mean.astype(np.float32)
-            shift += grad_mean.sum(axis=0)
-            turn += np.cross(model.gaussians.get("means") - result.view.position, grad_mean).sum(axis=0)
+            grad_shift += grad_mean.sum(axis=0)
+            grad_rotation += np.cross(model.gaussians.get("means") - result.view.position, grad_mean).sum(axis=0)
         rotation = pose[:, :3]
-        return Gradients(**tables, rotation=rotation @ turn, translation=rotation @ shift, log_focal=float(focal[0]))
+        return Gradients(
+            **tables,
+            rotation=rotation @ grad_rotation,
+            translation=rotation @ grad_shift,
+            log_focal=float(grad_focal[0]),
+        )
 
     def _forward(
         self, model: DeviceModel, camera: DeviceCamera, background: Floats, content: Content = "color"

@@ -25,7 +25,7 @@ def render_views(
     *,
     split: Literal["test", "train", "all"] = "test",
     downscale: float | None = None,
-    kind: Literal["png", "npy"] = "png",
+    format: Literal["png", "npy"] = "png",
     depth: bool | Literal["mean", "median"] = False,
     normals: bool = False,
     alpha: bool = False,
@@ -37,7 +37,7 @@ def render_views(
     model: a model file, or a run folder; a model file without `scene` is rendered once, from outside, to view.png
     scene: a dataset folder; default: the dataset of the run
     downscale: divisor of the image size; default: the downscale factor of the run, or 1 for a model file
-    kind: "png" writes 8-bit images, "npy" float32 arrays, [height, width, 3]
+    format: "png" writes 8-bit images, "npy" float32 arrays, [height, width, 3]
     depth: True or "mean" also writes NAME_depth, the mean depth; "median" also writes NAME_median_depth, the depth at
         which the transmittance falls below ½, or 0 if it stays above; in scene units, as arrays [height, width]
     normals: also write NAME_normals, from the mean depth, in scene axes, as arrays [height, width, 3]; 0 where unknown
@@ -49,16 +49,16 @@ def render_views(
     from clsplat.viewer.video.plan import VideoRequest
 
     load_plugins()
-    for option, value, choices in (("split", split, SPLITS), ("kind", kind, FORMATS)):
+    for option, value, choices in (("split", split, SPLITS), ("format", format, FORMATS)):
         if value not in choices:
             raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
     layers = layer_names(depth, normals, alpha)
     if scene is None and split == "test" and downscale is None and is_model_alone(Path(model)):
-        target, request = videos.VideoTarget(None, Path(out), kind), VideoRequest.parse("fixed", 1, None, None, time)
+        target, request = videos.VideoTarget(None, Path(out), format), VideoRequest.parse("fixed", 1, None, None, time)
         extras = videos.VideoExtras(None, layers)
         return len(videos.make_video(Path(model), None, target, request, extras, device=device)["files"])
     model_file = ModelFile(Path(model), to_path(scene), device, downscale)
-    return model_file.render(split, Path(out), kind, layers, time)
+    return model_file.render(split, Path(out), format, layers, time)
 
 
 def render_path(
@@ -79,7 +79,7 @@ def render_path(
     normals: bool = False,
     alpha: bool = False,
     downscale: float | None = None,
-    kind: Literal["png", "npy"] = "png",
+    format: Literal["png", "npy"] = "png",
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
     """Render a video of a model along a camera path, as `clsplat render --path` does.
@@ -88,7 +88,7 @@ def render_path(
     time `took`, in seconds.
 
     model, scene: as for `render_views`
-    video: a .webm file, or a .mp4 file if the extra `video` is installed; None writes images of this `kind` to `out`
+    video: a .webm file, or a .mp4 file if the extra `video` is installed; None writes images of this `format` to `out`
     path: ellipse, spiral, orbit, through, views, fixed, fixed:NAME with the name of a view, or a camera_path.json file;
         a model file without a scene has orbit, ellipse, and fixed, with up at -y
     frames: 120 by default; a single image of a fixed camera is named view.png
@@ -112,7 +112,7 @@ def render_path(
     load_plugins()
     request, target = (
         VideoRequest.parse(str(path), frames, fps, size, times, position, look_at),
-        videos.VideoTarget(to_path(video), Path(out), kind),
+        videos.VideoTarget(to_path(video), Path(out), format),
     )
     extras = videos.VideoExtras(None if side is None else str(side), layer_names(depth, normals, alpha))
     return videos.make_video(Path(model), to_path(scene), target, request, extras, downscale=downscale, device=device)

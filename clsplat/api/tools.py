@@ -103,7 +103,7 @@ def measure_speed(
 
 
 def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, Any]:
-    """Read the `data()` of an earlier measurement from a JSON file, to compare it with another of the same pipeline."""
+    """Read the `data()` of an earlier measurement of the same pipeline from a JSON file, for comparison."""
     from clsplat.conformance.bench import measurement
 
     load_plugins()

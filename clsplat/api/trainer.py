@@ -44,7 +44,7 @@ from clsplat.training.status import StatusFile
 class Report:
     """The result of a training step."""
 
-    step: int  # of the training, from 1
+    step: int  # global step, from 1
     gaussians: int
     view: ViewGradients  # the gradients of this step, valid until the next step
 
@@ -114,9 +114,8 @@ class Trainer:
                 self._run = opening.make_run(self.pipeline, run_scene, open_device, self.out, status)
                 self.pipeline = resolve_choices(self.pipeline, self._run)
                 runner.begin(self.pipeline, self._run, start)
-                (self.out / CHECKSUMS).unlink(
-                    missing_ok=True
-                )  # the list includes files of stages that a trainer does not run
+                # the checksums include files of stages that a trainer does not run
+                (self.out / CHECKSUMS).unlink(missing_ok=True)
                 with save_on_failure(self._run):
                     run_until_training(self.pipeline, self._run)
             stack.callback(_record_closed, status)

@@ -219,7 +219,7 @@ def align(
     images: Annotated[Literal["none", "copy"], typer.Option(help="Whether to copy the photos to a folder.")] = "copy",
     as_json: JsonOption = False,
 ) -> None:
-    """Give a scene or a model its true scale, up direction, or map coordinates, and print the errors that remain."""
+    """Give a scene or a model its true scale, up direction, or map coordinates, and print the remaining errors."""
     from clsplat.workflows.align import table
 
     if as_json:
@@ -354,8 +354,8 @@ def mesh(
         model, file, scene, voxel=voxel, keep=keep, collision=collision, downscale=scale, device=device
     )
     size = f"{result['faces']:,} faces, {result['vertices']:,} vertices, {result['bytes'] / 1e6:.3g} MB"
-    kind = "closed" if result["closed"] else "open"
-    terminal.print_message(f"{result['file']}: {size}; {kind}, voxel {result['voxel']:.3g} scene units")
+    topology = "closed" if result["closed"] else "open"
+    terminal.print_message(f"{result['file']}: {size}; {topology}, voxel {result['voxel']:.3g} scene units")
 
 
 @command("compare", "clsplat compare runs/splat runs/mip_splatting --out compare.html")
@@ -458,7 +458,7 @@ def render(
         options["position"] = _parse_numbers("--from", position, "a position, such as 0,-1,2.5")
         options["look_at"] = _parse_numbers("--look-at", look_at, "a position, such as 0,0,0")
         options["times"] = times if time is None else time
-        options |= {"depth": depth or False, "normals": normals, "alpha": alpha, "downscale": scale, "kind": format_}
+        options |= {"depth": depth or False, "normals": normals, "alpha": alpha, "downscale": scale, "format": format_}
         result = rendering.render_path(model, scene, file, out=out, device=device, **options)
         terminal.print_message(_video_text(result, columns=1 if side is None else 2))
         return
@@ -471,7 +471,7 @@ def render(
         out,
         split=split or "test",
         downscale=scale,
-        kind=format_,
+        format=format_,
         depth=depth or False,
         normals=normals,
         alpha=alpha,

@@ -329,13 +329,13 @@ def cell(
     device: DeviceOption = None,
     set_: SetOption = None,
 ) -> None:
-    """Run one cell of a matrix, unless its result is in the store.  Use it in the job arrays of any scheduler."""
+    """Run one cell of a matrix, unless its result is in the store.  Made for the job arrays of any scheduler."""
     commands.run_cell(pipeline, store, scene, index=index, set=set_ or (), device=device)
 
 
 @command("cancel", "clsplat cancel runs/store", "clsplat cancel runs/store seed=1")
 def cancel(
-    store: Annotated[Path, typer.Argument(metavar="STORE", help="The store of cells.")],
+    store: Annotated[Path, typer.Argument(metavar="STORE", help="The folder of the store.")],
     cell: Annotated[
         str | None, typer.Argument(metavar="[CELL]", help="A cell's name or key; default: all cells.")
     ] = None,

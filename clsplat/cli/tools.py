@@ -48,7 +48,7 @@ def doctor(
     if page is not None:  # after the verdict, which took minutes
         write_page(report, page)
     if not report.usable:
-        raise DeviceError(f"{report.info.text}: {report.verdict.text}")
+        raise DeviceError(f"{report.info.label}: {report.verdict.text}")
 
 
 POINTS_NOTE = (

@@ -138,7 +138,7 @@ class DeviceReport:
 
     def text(self) -> str:
         """Return the summary, a few lines of text."""
-        verdict, lines = self.verdict, [f"device    {self.info.text}, driver {self.info.driver}"]
+        verdict, lines = self.verdict, [f"device    {self.info.label}, driver {self.info.driver}"]
         for name, results in self.schedules.items():
             lines.append(f"{name:<9} {summary(results)}")
             lines += _failure_lines(self.failures[name])
@@ -209,7 +209,7 @@ def examine(device: str | Device | None = None) -> DeviceReport:
     info = device.info if isinstance(device, Device) else choose_device(device)
     default = resolve_schedule(info, "auto")
     report, start_time = DeviceReport(info, default), time.perf_counter()
-    LOG.info("checking %s; this takes a minute or two on a CPU", info.text)
+    LOG.info("checking %s; this takes a minute or two on a CPU", info.label)
     for schedule in SCHEDULES:
         if not _is_due(schedule, report):
             continue

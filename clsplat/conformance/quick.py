@@ -32,7 +32,7 @@ def open_verified(device: str | Device | None, schedule: Schedule = "auto", sort
     Use this to open the device for rendering or training.
     """
     result = open_device(device, schedule)
-    LOG.info("device: %s", result.text)
+    LOG.info("device: %s", result.label)
     ensure_correct(result, sort)
     return result
 
@@ -54,12 +54,12 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     LOG.info("checking %s; this takes a few seconds, or longer if its compiler is slow", info.name)
     for result in run_checks(info, schedule, [*ESSENTIAL, *(BITONIC if uses_bitonic else [])], TIMEOUT_S):
         if result.out_of_memory:
-            raise MemoryLimitError(f"{device.text}: {result.failures[0]}; close other programs that use its memory")
+            raise MemoryLimitError(f"{device.label}: {result.failures[0]}; close other programs that use its memory")
         if result.damaged_cache:
-            raise DeviceError(f"{device.text}: {kernel_cache_advice()}")
+            raise DeviceError(f"{device.label}: {kernel_cache_advice()}")
         if not result.passes:
             verdict = "cannot be trusted" if result.fault else "computes wrongly"
-            raise DeviceError(f"{device.text} {verdict}: {result.failures[0]}; run `clsplat doctor` for details")
+            raise DeviceError(f"{device.label} {verdict}: {result.failures[0]}; run `clsplat doctor` for details")
     remember(info, schedule, sorts)
 
 
@@ -67,7 +67,7 @@ def remember(info: DeviceInfo, schedule: FixedSchedule, sorts: Sequence[str] = S
     """Record that a device computes correctly.  If the cache is not writable, the next run checks the device again."""
     with suppress(OutputError):
         for sort in sorts:
-            write_text(_record_file(info, schedule, sort), f"{info.text}, {schedule}, {sort}\n")
+            write_text(_record_file(info, schedule, sort), f"{info.label}, {schedule}, {sort}\n")
 
 
 def forget(info: DeviceInfo, schedule: FixedSchedule) -> None:

@@ -17,7 +17,7 @@ from clsplat.core.machine import is_alive
 from clsplat.core.reading import read_json
 
 LOG = logging.getLogger("clsplat")
-# names of temporary files: .NAME.PROCESS-NUMBER.partial
+# names of temporary files: .NAME.PID-NUMBER.partial
 PARTIAL = re.compile(r"\..+\.(\d+)-\d+\.partial(\.\w+)?")
 NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM}
 SYSTEM = os.name
@@ -211,8 +211,8 @@ def _is_abandoned(name: str) -> bool:
     """Return whether a name is that of a temporary file or folder that no process on this machine is still writing."""
     if not (match := PARTIAL.fullmatch(name)) or name in _temporary_names:
         return False
-    process = int(match[1])
-    return process == os.getpid() or not is_alive(process)  # an earlier container may have had the same number
+    pid = int(match[1])
+    return pid == os.getpid() or not is_alive(pid)  # an earlier container may have had the same PID
 
 
 def path_exists(path: Path) -> bool:

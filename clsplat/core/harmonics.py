@@ -9,7 +9,7 @@ DIRECTIONS = 64  # samples: enough to fit the 7 functions of a band and, with th
 BAND_0 = 0.28209479177387814
 ROWS = 4096  # Gaussians per block, to limit temporary memory
 Floats = NDArray[np.float64]
-DIGITS = 6  # decimals of means; further ones differ between processors
+DIGITS = 6  # decimals of means; further digits differ between processors
 
 
 def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -32,8 +32,8 @@ def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean of the basis functions Y(d), [K], over a distribution of directions d.
 
     `form`, [K, K], is proportional to the mean of Y(d) Y(d)^T.  Products of two functions of bands 1 to 3 span all
-    functions of these bands.  Products of two functions of band 1 do not span band 1, so with that band alone the
-    result is 0.
+    functions of these bands.  Products of two functions of band 1 do not span band 1, so the result is 0 if
+    band 1 is the only one.
     """
     count, directions = len(form), _directions()
     values = basis(np.concatenate([directions, -directions]))[:, :count]

@@ -38,7 +38,7 @@ def owner_record() -> str:
 
 
 def read_owner(file: io.FileIO) -> dict[str, Any]:
-    """Return the owner that a lock file names, or {} if it is empty or damaged."""
+    """Return the owner's record in a lock file, or {} if the file is empty or damaged."""
     try:
         file.seek(0)
         owner = json.loads(file.read(LOCK_OFFSET))
@@ -53,17 +53,17 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
     Machines may share a name, so boot IDs are compared where both are known.
     Raises OutputError if the heartbeat in the run's status, a file next to the lock file, is recent.
     """
-    owner = read_owner(file)
-    holder, local = Owner.from_record(owner), Owner.current()
-    if holder is None or (holder.boot == local.boot if owner.get("boot") and local.boot else holder.host == local.host):
+    record = read_owner(file)
+    owner, local = Owner.from_record(record), Owner.current()
+    if owner is None or (owner.boot == local.boot if record.get("boot") and local.boot else owner.host == local.host):
         return {}
     heartbeat = _heartbeat(path)
     if heartbeat is not None and (age := time.time() - heartbeat) < HEARTBEAT_TIMEOUT:
         raise OutputError(
-            f"{in_use_message(folder, owner)}; the last heartbeat of that process is {max(0, age):.0f} s old; "
+            f"{in_use_message(folder, record)}; the last heartbeat of that process is {max(0, age):.0f} s old; "
             f"if it has exited, wait a minute or remove {path}"
         )
-    return owner
+    return record
 
 
 def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
@@ -284,7 +284,7 @@ def _remove(file: io.FileIO, path: Path) -> None:
         if _is_still_at(file, temporary):
             temporary.unlink()
         else:
-            with suppress(FileExistsError):  # a third process has created one
+            with suppress(FileExistsError):  # a third process has created a new lock file
                 os.link(temporary, path)
             temporary.unlink()
 

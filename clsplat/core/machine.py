@@ -133,7 +133,7 @@ def split_cores(cores: Cores, processes: int) -> list[tuple[int, ...]]:
     Leftover cores stay unused, so that all processes have the same number.
     """
     count = len(cores) // processes
-    return [tuple(cores[process * count : (process + 1) * count]) for process in range(processes)]
+    return [tuple(cores[i * count : (i + 1) * count]) for i in range(processes)]
 
 
 def limited_environment(cores: Cores, variables: Mapping[str, str] = os.environ) -> dict[str, str]:
@@ -141,16 +141,16 @@ def limited_environment(cores: Cores, variables: Mapping[str, str] = os.environ)
     return {**variables, **dict.fromkeys(THREAD_VARIABLES, str(len(cores)))}
 
 
-def pin_to_cores(cores: Cores, process: int = 0) -> None:
+def pin_to_cores(cores: Cores, pid: int = 0) -> None:
     """Pin a process (0: this one) and its future children to these cores, if the system supports it."""
     if hasattr(os, "sched_setaffinity"):
         with suppress(OSError):  # the process has exited, or the container's cores have changed
-            os.sched_setaffinity(process, cores)
+            os.sched_setaffinity(pid, cores)
 
 
 # Processes: their identity across hosts and containers, and whether they are running.
 
-FIRST_PID_NAMESPACE = "pid:[4026531836]"  # that of the host, outside containers: PROC_PID_INIT_INO in Linux
+FIRST_PID_NAMESPACE = "pid:[4026531836]"  # the host's namespace, outside containers: PROC_PID_INIT_INO in Linux
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 QUERY_LIMITED_INFORMATION, STILL_ACTIVE, ACCESS_DENIED = 0x1000, 259, 5  # Windows constants
 
@@ -171,7 +171,7 @@ class Owner:
 
     @classmethod
     def from_record(cls, values: Mapping[str, Any]) -> "Owner | None":
-        """Return the process named in a record, or None.  Values that older records lack are those of this process."""
+        """Return the process in a record, or None.  Values that older records lack are taken from this process."""
         process, current = values.get("process"), cls.current()
         if type(process) is not int or process <= 0:
             return None
@@ -185,7 +185,7 @@ class Owner:
 
     @property
     def is_local(self) -> bool:
-        """Whether its process ID is valid on this host and in this container."""
+        """Whether the process ID is valid on this host and in this container."""
         return replace(self, process=os.getpid()) == Owner.current()
 
     @property
@@ -220,15 +220,15 @@ def _boot_id() -> str | None:
         return None
 
 
-def is_alive(process: int) -> bool:
+def is_alive(pid: int) -> bool:
     """Return whether a process of this machine is running; True if unknown.
 
-    The ID may belong to another, newer process.
+    After a process exits, a newer one may have its ID.
     """
-    if sys.platform == "win32":  # os.kill(process, 0) would kill it there
-        return _is_alive_on_windows(ctypes.WinDLL("kernel32", use_last_error=True), process)
+    if sys.platform == "win32":  # os.kill(pid, 0) would end the process there
+        return _is_alive_on_windows(ctypes.WinDLL("kernel32", use_last_error=True), pid)
     try:
-        os.kill(process, 0)
+        os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except (OSError, OverflowError):
@@ -236,9 +236,9 @@ def is_alive(process: int) -> bool:
     return True
 
 
-def _is_alive_on_windows(kernel: Any, process: int) -> bool:
+def _is_alive_on_windows(kernel: Any, pid: int) -> bool:
     kernel.OpenProcess.restype = ctypes.c_void_p
-    handle = kernel.OpenProcess(QUERY_LIMITED_INFORMATION, False, process)
+    handle = kernel.OpenProcess(QUERY_LIMITED_INFORMATION, False, pid)
     if not handle:
         return bool(ctypes.get_last_error() == ACCESS_DENIED)  # type: ignore[attr-defined,unused-ignore]
     code = ctypes.c_ulong()

@@ -98,7 +98,7 @@ class ItemCounter:
 
     @property
     def seconds_left(self) -> float | None:
-        """The estimated time for the remaining items; None before the first is done."""
+        """The estimated time for the remaining items; None before the first item is done."""
         if not self.is_uniform or self._start is None or self.done <= self._start[1]:
             return None
         start, start_count = self._start

@@ -54,7 +54,7 @@ class Curve(Settings):
     @property
     @abstractmethod
     def values(self) -> list[float]:
-        """The values to check against bounds, including the smallest and the largest."""
+        """Values of the curve, including the smallest and the largest, to check against bounds."""
 
     def divide(self, factor: float) -> "Curve":
         """Return the curve with its values divided by a factor.  Raises ConfigError if it does not support that."""
@@ -67,8 +67,8 @@ class _Curves:
     """An annotation of a field that accepts any curve, recognized by its keys."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        kinds = [kind for kind in Settings.subclasses if issubclass(kind, Curve) and not inspect.isabstract(kind)]
-        return core_schema.union_schema([handler.generate_schema(kind) for kind in kinds])
+        classes = [cls for cls in Settings.subclasses if issubclass(cls, Curve) and not inspect.isabstract(cls)]
+        return core_schema.union_schema([handler.generate_schema(cls) for cls in classes])
 
 
 class Points(Curve):

@@ -39,13 +39,13 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
     subclasses: ClassVar[list[type["Settings"]]] = []  # all subclasses in order of definition
     output_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume: the model does not depend on them
-    training_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume, but the bits then change too
+    training_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume, but the model then differs
     step_keys: ClassVar[frozenset[str]] = frozenset()  # step numbers that scale with the length of training
     keyed_by_type: ClassVar[bool] = False  # lists contain each type at most once, and items are addressed by type
     rate_keys: ClassVar[frozenset[str]] = (
         frozenset()
     )  # schedules whose values are divided when training is longer, so that sums stay the same
-    family: ClassVar[str] = ""  # another name, next to its type, that `conflicts` may use
+    family: ClassVar[str] = ""  # a name besides the type that `conflicts` of other settings may use
     unavailable: ClassVar[Mapping[str, str]] = {}  # unknown keys that other settings have, each with advice
     conflicts: ClassVar[Mapping[str, str]] = {}
     """Types or families that exclude this one, in the same stage or outside of stages, each with `reason; advice`."""
@@ -98,13 +98,13 @@ def iter_settings(value: Any, path: str = "") -> Iterator[tuple[str, Settings]]:
 
 
 @functools.cache
-def descriptions(kind: type[BaseModel]) -> dict[str, str]:
+def descriptions(cls: type[BaseModel]) -> dict[str, str]:
     """Return the docstrings of a class's fields by name, or nothing if its source cannot be read.
 
     The source is parsed on demand: parsing all classes would make the start a third slower.
     """
     result: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
+    for base in reversed(cls.__mro__):
         if not (issubclass(base, BaseModel) and base.__annotations__):
             continue
         try:
@@ -116,20 +116,20 @@ def descriptions(kind: type[BaseModel]) -> dict[str, str]:
             match node, next_node:
                 case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
                     result[name] = inspect.cleandoc(text)
-    return {name: text for name, text in result.items() if name in kind.model_fields}
+    return {name: text for name, text in result.items() if name in cls.model_fields}
 
 
-def variant_tag(kind: type[Settings]) -> tuple[str, str] | None:
+def variant_tag(cls: type[Settings]) -> tuple[str, str] | None:
     """Return the tag field of a variant and the variant's name, or None for a base class."""
     for tag in TAGS:
-        if tag in kind.model_fields and (names := typing.get_args(kind.model_fields[tag].annotation)):
+        if tag in cls.model_fields and (names := typing.get_args(cls.model_fields[tag].annotation)):
             return tag, str(names[0])
     return None
 
 
-def resume_effect(kind: type[Settings], key: str) -> Literal["output", "training"] | None:
+def resume_effect(cls: type[Settings], key: str) -> Literal["output", "training"] | None:
     """Return what a change of a key's value on resume affects, or None if the value may not change."""
-    bases = [base for base in kind.__mro__ if issubclass(base, Settings)]
+    bases = [base for base in cls.__mro__ if issubclass(base, Settings)]
     if any(key in base.output_keys for base in bases):
         return "output"
     return "training" if any(key in base.training_keys for base in bases) else None
@@ -143,36 +143,36 @@ def variants(base: type[Base]) -> dict[str, type[Base]]:
 @functools.lru_cache(maxsize=256)
 def _variants_by_name(base: type[Base], subclasses: tuple[type["Settings"], ...]) -> dict[str, type[Base]]:
     by_name: dict[str, type[Base]] = {}
-    for kind in subclasses:
-        if not issubclass(kind, base) or (tag := variant_tag(kind)) is None:
+    for cls in subclasses:
+        if not issubclass(cls, base) or (tag := variant_tag(cls)) is None:
             continue
         if tag[1] in by_name:
-            classes = " and ".join(f"{variant.__module__}.{variant.__name__}" for variant in (by_name[tag[1]], kind))
+            classes = " and ".join(f"{variant.__module__}.{variant.__name__}" for variant in (by_name[tag[1]], cls))
             raise ConfigError(f"two variants of {base.__name__} have the name '{tag[1]}': {classes}; rename one")
-        by_name[tag[1]] = kind
+        by_name[tag[1]] = cls
     return by_name
 
 
-def invalid_variant_reason(kind: type[Settings]) -> str | None:
+def invalid_variant_reason(cls: type[Settings]) -> str | None:
     """Return the reason why a class that resembles a variant cannot be used in a pipeline file, or None."""
-    if kind.__subclasses__():
+    if cls.__subclasses__():
         return None
-    if missing_methods := sorted(getattr(kind, "__abstractmethods__", ())):
+    if missing_methods := sorted(getattr(cls, "__abstractmethods__", ())):
         return f"lacks {', '.join(missing_methods)}"
-    bases = [base for base in kind.__mro__[1:] if issubclass(base, Settings) and base is not Settings]
+    bases = [base for base in cls.__mro__[1:] if issubclass(base, Settings) and base is not Settings]
     tags = [tag for base in bases for other in variants(base).values() if (tag := variant_tag(other))]
     if not tags:
         return None
-    field = kind.model_fields.get(tags[0][0])
+    field = cls.model_fields.get(tags[0][0])
     names = typing.get_args(field.annotation) if field else ()
     if len(names) == 1 and isinstance(names[0], str):
         return None
-    return f'expected one name, as in `{tags[0][0]}: Literal["{kind.__name__.lower()}"]`'
+    return f'expected one name, as in `{tags[0][0]}: Literal["{cls.__name__.lower()}"]`'
 
 
-def needs_settings(kind: type[Settings]) -> bool:
+def needs_settings(cls: type[Settings]) -> bool:
     """Return whether a variant has required keys, so that its name alone is not enough."""
-    return any(field.is_required() for name, field in kind.model_fields.items() if name not in TAGS)
+    return any(field.is_required() for name, field in cls.model_fields.items() if name not in TAGS)
 
 
 class Variants:
@@ -184,11 +184,11 @@ class Variants:
     @property
     def tag(self) -> str:
         """The field that contains a variant's name."""
-        return next((tag[0] for kind in variants(self.base).values() if (tag := variant_tag(kind))), TAGS[-1])
+        return next((tag[0] for cls in variants(self.base).values() if (tag := variant_tag(cls))), TAGS[-1])
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         tag = self.tag
-        choices = {name: handler.generate_schema(kind) for name, kind in variants(self.base).items()}
+        choices = {name: handler.generate_schema(cls) for name, cls in variants(self.base).items()}
 
         def with_tag(value: Any) -> Any:
             return {tag: value} if isinstance(value, str) else value
@@ -197,7 +197,7 @@ class Variants:
         return core_schema.no_info_before_validator_function(with_tag, union)
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        names = [name for name, kind in variants(self.base).items() if not needs_settings(kind)]
+        names = [name for name, cls in variants(self.base).items() if not needs_settings(cls)]
         mapping = {"required": [self.tag], **handler(schema)}
         return {"anyOf": [{"enum": names}, mapping]} if names else mapping
 
@@ -227,9 +227,9 @@ def in_one_sentence(expected: str) -> WrapValidator:
 InputPath = Annotated[str, AfterValidator(_check_path)]  # an input file or folder
 
 
-def is_input_path(kind: type[Settings], key: str) -> bool:
+def is_input_path(cls: type[Settings], key: str) -> bool:
     """Return whether the value of a key is the path of an input file or folder."""
-    field = kind.model_fields[key]
+    field = cls.model_fields[key]
     return InputPath in (field.annotation, *typing.get_args(field.annotation)) or any(
         isinstance(item, AfterValidator) and item.func is _check_path for item in field.metadata
     )
@@ -238,11 +238,11 @@ def is_input_path(kind: type[Settings], key: str) -> bool:
 class VariantName:
     """An annotation of a field that accepts the name of a variant of `base` for which `accepts` returns True."""
 
-    def __init__(self, base: type[Base], accepts: Callable[[type[Base]], bool] = lambda kind: True) -> None:
+    def __init__(self, base: type[Base], accepts: Callable[[type[Base]], bool] = lambda cls: True) -> None:
         self.base, self._accepts = base, accepts
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.literal_schema([name for name, kind in variants(self.base).items() if self._accepts(kind)])
+        return core_schema.literal_schema([name for name, cls in variants(self.base).items() if self._accepts(cls)])
 
 
 if TYPE_CHECKING:
@@ -264,9 +264,9 @@ def import_modules(package: str, path: Iterable[str]) -> None:
 
 def rebuild_models() -> None:
     """Rebuild all models, so that their fields accept variants defined later, such as those of a plug-in."""
-    built_models = [kind for kind in Settings.subclasses if kind.__pydantic_complete__]  # others: built on first use
-    for kind in built_models:  # schemas contain those of nested variants
-        if "__pydantic_core_schema__" in vars(kind):
-            del kind.__pydantic_core_schema__
-    for kind in built_models:
-        kind.model_rebuild(force=True)
+    built_models = [cls for cls in Settings.subclasses if cls.__pydantic_complete__]  # others: built on first use
+    for cls in built_models:  # schemas contain those of nested variants
+        if "__pydantic_core_schema__" in vars(cls):
+            del cls.__pydantic_core_schema__
+    for cls in built_models:
+        cls.model_rebuild(force=True)

@@ -15,7 +15,7 @@ from clsplat.core.errors import OutputError
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # SIGBREAK: Ctrl-Break on Windows, or a closed window
 GRACE = 60.0  # seconds to stop after stdin has closed, before the process exits
-IMPORT_SECONDS = 10.0  # longest wait for an import; that of a plug-in may never end
+IMPORT_SECONDS = 10.0  # longest wait for an import; the import of a plug-in may never end
 
 
 class _Received:

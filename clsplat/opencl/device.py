@@ -219,7 +219,7 @@ class Device:
         self.finish()
 
     def __repr__(self) -> str:
-        return f"Device({self.text!r})"
+        return f"Device({self.label!r})"
 
     def _fit_groups(self) -> None:
         """Use tiles of 8 x 8 px if the compiler does not allow blending groups of 16 x 16 items."""
@@ -233,8 +233,8 @@ class Device:
             self.program("blend_simt.cl")
 
     @property
-    def text(self) -> str:
-        return f"{self.info.text}, {self.schedule} schedule"
+    def label(self) -> str:
+        return f"{self.info.label}, {self.schedule} schedule"
 
     @property
     def queue(self) -> Any:
@@ -327,7 +327,7 @@ def open_device(device: str | Device | None = None, schedule: Schedule = "auto")
         raise ConfigError(f"device: expected part of a device name, or a Device, got {type(device).__name__}")
     if schedule != "auto" and resolve_schedule(device.info, schedule) != device.schedule:
         raise ConfigError(
-            f"device: is open as {device.text}; the settings need {schedule}: open it with schedule='{schedule}'"
+            f"device: is open as {device.label}; the settings need {schedule}: open it with schedule='{schedule}'"
         )
     return device
 
@@ -451,7 +451,7 @@ class Kernel:
         items, limit = math.prod(self.group), group_limit(kernel, cl_device)
         if items > limit and not underreports_group_limit(device.info, limit, group_multiple(kernel, cl_device)):
             raise KernelError(
-                f"{label} needs work-groups of {items} items, but {device.info.text} allows {limit}; "
+                f"{label} needs work-groups of {items} items, but {device.info.label} allows {limit}; "
                 "use another device, rasterizer.schedule, or rasterizer.sort"
             )
 
@@ -524,7 +524,7 @@ class Program:
             program = build(device.context, source, tuple(options))
         except cl.Error as error:
             raise KernelError(
-                f"{file} does not build on {device.text} with {' '.join(options)}: {_first_error(error)}"
+                f"{file} does not build on {device.label} with {' '.join(options)}: {_first_error(error)}"
             ) from error
         try:
             self.kernels = {
@@ -533,7 +533,7 @@ class Program:
             }
         except CACHE_ERRORS as error:
             raise KernelError(
-                f"{file} was built on {device.text}, but its kernels cannot be created ({error}); the cache of built "
+                f"{file} was built on {device.label}, but its kernels cannot be created ({error}); the cache of built "
                 f"kernels may be damaged: remove {kernel_caches()}"
             ) from error
         names = program.get_info(cl.program_info.KERNEL_NAMES).split(";")

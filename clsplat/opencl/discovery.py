@@ -42,7 +42,7 @@ class DeviceInfo:
     unified: bool = False  # whether it shares the host's memory: an integrated GPU
 
     @property
-    def text(self) -> str:
+    def label(self) -> str:
         return f"{self.name} ({self.kind}) on {self.platform}"
 
     def fault(self) -> str | None:
@@ -134,11 +134,13 @@ def choose_device(device_name: str | None = None) -> DeviceInfo:
     for info in sorted(devices, key=_rank):
         fault = info.fault()
         if fault is None:
-            other_gpus = [device.text for device in devices if device.kind == info.kind == "GPU" and device is not info]
+            other_gpus = [
+                device.label for device in devices if device.kind == info.kind == "GPU" and device is not info
+            ]
             if other_gpus:
-                LOG.info("using %s; other GPUs: %s; select one with --device NAME", info.text, "; ".join(other_gpus))
+                LOG.info("using %s; other GPUs: %s; select one with --device NAME", info.label, "; ".join(other_gpus))
             return info
-        faults.append(f"{info.text} does not work: {fault}")
+        faults.append(f"{info.label} does not work: {fault}")
         LOG.warning("%s", faults[-1])
     raise runtimes.no_device_error("; ".join(faults))
 
@@ -157,11 +159,11 @@ def _find_by_name(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
     name, number = match.groups() if match else (device_name, "0")
     candidates = [info for info in devices if info.matches(name)]
     if int(number) >= len(candidates):
-        raise DeviceError(f"no device matches {quote(device_name)}; available: {'; '.join(i.text for i in devices)}")
+        raise DeviceError(f"no device matches {quote(device_name)}; available: {'; '.join(i.label for i in devices)}")
     info = candidates[int(number)]
     fault = info.fault()
     if fault is not None:
-        raise runtimes.no_device_error(f"{info.text} does not work: {fault}")
+        raise runtimes.no_device_error(f"{info.label} does not work: {fault}")
     return info
 
 

@@ -55,8 +55,9 @@ class Adaptation(Settings):
         return [decision.key for decision in self.decide(training, Measures(0))]
 
 
-FEW = 40  # training photos; the hull of fewer silhouettes is too large
-DROPOUT, MAX_DROPOUT = 0.25, 0.2  # probabilities for no photo, decreasing linearly to 0 at FEW photos, and at most
+FEW_PHOTOS = 40  # training photos; the hull of fewer silhouettes is too large
+DROPOUT = 0.25  # probability, multiplied by 1 - photos / FEW_PHOTOS
+MAX_DROPOUT = 0.2  # largest probability
 DROPOUT_UNTIL = 1460 / 3400  # fraction of the training steps over which the probability rises
 MIN_FOR_SKY = 12  # training photos; fewer show too little of the background
 MAX_ERROR = 1.0  # px, mean reprojection error at the training size; poses are optimized if it is this large
@@ -70,32 +71,37 @@ class Photos(Adaptation):
     type: Literal["photos"] = "photos"
 
     def decide(self, training: Optimize, measures: Measures) -> Iterator[Decision]:
-        few = measures.photographs < FEW
-        count = pluralize(measures.photographs, "training photo")
+        is_small = measures.photograph_count < FEW_PHOTOS
+        count = pluralize(measures.photograph_count, "training photo")
         has_alpha = measures.scene is not None and is_transparent(measures.scene)
         lacks_points = measures.scene is not None and measures.scene.points is None
 
         reason = "the hull of few silhouettes is too large, so points start at random"
-        reason = f"{count}: {reason if few else 'points start in the hull of the silhouettes'}"
+        reason = f"{count}: {reason if is_small else 'points start in the hull of the silhouettes'}"
         yield Decision(
             key="init.transparent",
-            value="random" if few else "hull",
+            value="random" if is_small else "hull",
             reason=reason,
             matters=has_alpha and lacks_points,
         )
-        yield Decision(key="init.count", value=100_000 if few else 60_000, reason=reason, matters=False)
+        yield Decision(key="init.count", value=100_000 if is_small else 60_000, reason=reason, matters=False)
 
-        probability = min(MAX_DROPOUT, round(DROPOUT * (1 - measures.photographs / FEW), 3))
+        probability = min(MAX_DROPOUT, round(DROPOUT * (1 - measures.photograph_count / FEW_PHOTOS), 3))
         rise = [[0, 0.0], [round(DROPOUT_UNTIL * training.steps), probability]]
-        dropout = {"probability": rise} if few and has_alpha else None
+        dropout = {"probability": rise} if is_small and has_alpha else None
         reason = f"{count} {'with' if has_alpha else 'without'} transparency: {'' if dropout else 'no '}dropout"
         yield Decision(key="optimize.modules.dropout", value=dropout, reason=reason, matters=dropout is not None)
-        random = {"when": "transparent"} if few else None
-        reason = f"{count}: {'random' if few else 'no random'} colors behind transparent pixels"
-        yield Decision(key="optimize.modules.random_background", value=random, reason=reason, matters=few and has_alpha)
+        random_background = {"when": "transparent"} if is_small else None
+        reason = f"{count}: {'random' if is_small else 'no random'} colors behind transparent pixels"
+        yield Decision(
+            key="optimize.modules.random_background",
+            value=random_background,
+            reason=reason,
+            matters=is_small and has_alpha,
+        )
 
         # The modules log what they choose for the sky and for exposures.
-        sky = {"type": "auto"} if measures.photographs >= MIN_FOR_SKY else None
+        sky = {"type": "auto"} if measures.photograph_count >= MIN_FOR_SKY else None
         reason = "a sky, if they show one" if sky else "too few for a sky"
         yield Decision(key="model.background", value=sky, reason=f"{count}: {reason}", matters=False)
 

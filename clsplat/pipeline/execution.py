@@ -70,7 +70,7 @@ class LocalExecution(Settings):
     packing: Annotated[int, Field(ge=1)] = 1
     """With engine local: processes that run on each CPU device at the same time and share its cores."""
     retries: Annotated[int, Field(ge=1)] = 3
-    """Number of failures without a newer checkpoint after which a cell is given up."""
+    """Number of failures in a row, without a newer checkpoint in between, after which a cell is not run again."""
 
     @model_validator(mode="after")
     def _refuse_unused_keys(self) -> "LocalExecution":

@@ -114,8 +114,8 @@ EXPECTATIONS = {
     "less_than": "a value less than {lt}",
     "less_than_equal": "a value of at most {le}",
     "finite_number": "a finite number",
-    "too_short": "a list of at least {min_length}",
-    "too_long": "a list of at most {max_length}",
+    "too_short": "a list of at least {min_length} items",
+    "too_long": "a list of at most {max_length} items",
     "string_pattern_mismatch": "text that matches {pattern}",
 }
 

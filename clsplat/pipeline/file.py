@@ -44,14 +44,14 @@ class SceneSettings(Settings):
     levels: Annotated[int, Field(ge=1, le=8)] = 1
     """Number of image sizes in training, with divisors of `downscale`, twice `downscale`, four times `downscale`, …."""
     alpha: Alpha = "transparency"
-    """Alpha channel of images: blended with the background, or a mask of the pixels that count."""
+    """Use of the alpha channel of images: `transparency` blends them with the background, `mask` masks pixels out."""
     masks: InputPath | None = None
     """Folder of masks, if the dataset has none: `a.png` or `a.jpg.png` for the image a.jpg, of the same size, white
-    where pixels count.  All pixels count in an image without a mask."""
+    where pixels are used.  Without a mask, all pixels of an image are used."""
     background: Literal["auto", "black", "white"] = "auto"
     """Color behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
-    """MiB of images on the device; default: a quarter of its memory."""
+    """Memory for images on the device, MiB; default: a quarter of its memory."""
     holdout: Selection = HOLDOUT
     """Test views: every n-th image by name, starting with the first; 0: none; or {every, offset}, {names} or {file}.
     Names replace the split of a dataset that has one."""
@@ -114,7 +114,7 @@ class RasterizerSettings(Settings):
     sort: Sort = "auto"
     """Algorithm that sorts splats by tile and depth; auto: the faster one on the first frame."""
     pair_budget: Annotated[int, Field(gt=0)] | None = None
-    """MiB of gradient records at a time; default: the largest buffer of the device."""
+    """Memory for gradient records, MiB; default: the largest buffer of the device."""
     harmonics: Harmonics = "auto"
     """Memory for the spherical harmonics above band 0 and their Adam moments in training.  `host`: each step uploads
     the Gaussians that its view sees, and downloads them again; the others are updated later, as with

@@ -14,7 +14,7 @@ from clsplat.core.files import PIPELINE
 from clsplat.core.reading import read_file
 from clsplat.core.resources import resource_dir
 
-ENDINGS = {"short": "_7k", "draft": "_draft", "high": "_high"}  # of the names of variants, by their key in the file
+ENDINGS = {"short": "_7k", "draft": "_draft", "high": "_high"}  # suffixes of variants' names, by key in the file
 VARIANT_KEY = re.compile(rf"^({'|'.join(ENDINGS)})\s*:".encode(), re.MULTILINE)
 
 

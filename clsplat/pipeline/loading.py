@@ -318,7 +318,7 @@ def _check_order(path: Path, settings: PipelineFile) -> None:
             if getattr(stage, key) != type(stage).model_fields[key].default:
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage}: '{key}' belongs inside optimize.during")
         for need in sorted(stage.needs - available_items):
-            makers = ", ".join(name for name, kind in variants(Stage).items() if need in kind.makes)
+            makers = ", ".join(name for name, cls in variants(Stage).items() if need in cls.makes)
             if need in removed:
                 reason = f"which {removed[need]} removes; add {makers} in between"
                 raise ConfigError(f"{path}: stages[{i}] {stage.stage} needs '{need}', {reason}")

@@ -174,8 +174,8 @@ class _Node:
 
     def _may_contain_stages(self, key: str) -> bool:
         """Return whether a list contains stages or has an unknown type."""
-        kinds = bases(item_annotation(self.annotation(key)))
-        return self.annotation(key) is None or any(Variants(kind).tag == "stage" for kind in kinds)
+        item_bases = bases(item_annotation(self.annotation(key)))
+        return self.annotation(key) is None or any(Variants(base).tag == "stage" for base in item_bases)
 
     def _stage(self, name: str, text: str) -> "_Node | None":
         """Return the node of the stage with a name, or None.  The root also searches the stages inside other stages.

@@ -38,7 +38,7 @@ class Plugin:
     path: Path
     digest: str  # SHA-256 of its Python files, the kernel files that they name, and the headers of the kernels
     is_installed: bool  # from a package rather than --plugin
-    kinds: tuple[type, ...]  # its classes of settings and readers
+    classes: tuple[type, ...]  # its settings and readers
 
 
 def load_file(path: Path) -> Plugin:
@@ -58,11 +58,11 @@ def load_file(path: Path) -> Plugin:
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ConfigError(f"--plugin {path}: expected a Python file with the suffix .py")
-    with _collect_classes(name, path) as kinds:
+    with _collect_classes(name, path) as classes:
         module = sys.modules[name] = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     digest = hash_plugin_files(path, *_imported_files(module, path.parent))
-    _loaded[path.stem] = Plugin(path.stem, path, digest, is_installed=False, kinds=tuple(kinds))
+    _loaded[path.stem] = Plugin(path.stem, path, digest, is_installed=False, classes=tuple(classes))
     return _loaded[path.stem]
 
 
@@ -78,17 +78,17 @@ def loaded_plugins() -> list[Plugin]:
     return list(_loaded.values())
 
 
-def used_by(kinds: Collection[type]) -> dict[str, str]:
+def used_by(classes: Collection[type]) -> dict[str, str]:
     """Return the names and content hashes of the plug-ins that a run may use, given the classes of its settings.
 
     These are all plug-ins from files, and the installed plug-ins that define one of the classes or of their bases.
     Plug-ins with a reader are included, because a run may be checked before its scene is known.
     """
-    bases = {base for kind in kinds for base in kind.__mro__}
+    bases = {base for cls in classes for base in cls.__mro__}
     return {
         plugin.name: plugin.digest
         for plugin in loaded_plugins()
-        if not plugin.is_installed or any(kind in bases or not issubclass(kind, Settings) for kind in plugin.kinds)
+        if not plugin.is_installed or any(cls in bases or not issubclass(cls, Settings) for cls in plugin.classes)
     }
 
 
@@ -131,15 +131,19 @@ def hash_plugin_files(*modules: Path) -> str:
 
 
 def _load_entry(entry: EntryPoint) -> Plugin:
-    with _collect_classes(entry.module) as kinds:
+    with _collect_classes(entry.module) as classes:
         module = importlib.import_module(entry.module)
         package = _root_package(module)
         path = Path(module.__file__ or entry.module)
         files = sorted(path for folder in getattr(package, "__path__", ()) for path in Path(folder).rglob("*.py"))
         digest = hash_plugin_files(path, *files)
-    all_kinds = [kind for classes in _class_lists() for kind in classes]  # another plug-in may have imported the module
-    package_kinds = [kind for kind in all_kinds if _is_within(kind.__module__, package.__name__)]
-    return Plugin(entry.name, path, digest, is_installed=True, kinds=tuple(dict.fromkeys([*kinds, *package_kinds])))
+    all_classes = [
+        cls for registered in _class_lists() for cls in registered
+    ]  # another plug-in may have imported the module
+    package_classes = [cls for cls in all_classes if _is_within(cls.__module__, package.__name__)]
+    return Plugin(
+        entry.name, path, digest, is_installed=True, classes=tuple(dict.fromkeys([*classes, *package_classes]))
+    )
 
 
 @contextmanager
@@ -149,29 +153,33 @@ def _collect_classes(module: str, path: Path | None = None) -> Iterator[list[typ
     If the block fails or two classes have the same name, remove everything that the block defined, and raise
     ConfigError.  Every exception except KeyboardInterrupt is converted.
     """
-    kinds: list[type] = []
+    classes: list[type] = []
     lists = _class_lists()  # complete for this package, so that new classes belong to the plug-in
-    old_lists, modules = [list(classes) for classes in lists], set(sys.modules)
+    old_lists, modules = [list(registered) for registered in lists], set(sys.modules)
     try:
         with redirect_stdout(sys.stderr):  # stdout is for results
-            yield kinds
-        new_kinds = [kind for classes, old in zip(lists, old_lists, strict=True) for kind in classes if kind not in old]
-        kinds += [kind for kind in new_kinds if not _is_within(kind.__module__, "clsplat")]
+            yield classes
+        new_classes = [
+            cls for registered, old in zip(lists, old_lists, strict=True) for cls in registered if cls not in old
+        ]
+        classes += [cls for cls in new_classes if not _is_within(cls.__module__, "clsplat")]
         rebuild_models()
         readers()
-        for kind in kinds:
-            setattr(sys.modules[kind.__module__], PLUGIN_MARK, True)
-            if issubclass(kind, Settings) and (fault := invalid_variant_reason(kind)):
-                raise ConfigError(f"class {kind.__name__}: {fault}")
+        for cls in classes:
+            setattr(sys.modules[cls.__module__], PLUGIN_MARK, True)
+            if issubclass(cls, Settings) and (fault := invalid_variant_reason(cls)):
+                raise ConfigError(f"class {cls.__name__}: {fault}")
     except BaseException as error:
         location = _locate(module, path, error)
-        new_kinds = [kind for classes, old in zip(lists, old_lists, strict=True) for kind in classes if kind not in old]
-        new_modules = {kind.__module__ for kind in new_kinds}
+        new_classes = [
+            cls for registered, old in zip(lists, old_lists, strict=True) for cls in registered if cls not in old
+        ]
+        new_modules = {cls.__module__ for cls in new_classes}
         for name in set(sys.modules) - modules:
             if name in new_modules or _is_within(name, module.partition(".")[0]):
                 del sys.modules[name]
-        for classes, old in zip(lists, old_lists, strict=True):
-            classes[:] = [kind for kind in classes if kind in old or _is_within(kind.__module__, "clsplat")]
+        for registered, old in zip(lists, old_lists, strict=True):
+            registered[:] = [cls for cls in registered if cls in old or _is_within(cls.__module__, "clsplat")]
         rebuild_models()
         if isinstance(error, KeyboardInterrupt):
             raise

@@ -90,18 +90,18 @@ def json_schema() -> dict[str, Any]:
     """Return the JSON schema of a pipeline file, in which a stage is a name, or a name with settings."""
     schema = PipelineFile.model_json_schema()
     definitions = schema["$defs"]
-    for kind in (*variants(Stage).values(), *variants(Step).values()):
-        definitions[kind.__name__]["properties"].pop("stage", None)
-        definitions[kind.__name__]["required"] = [
-            key for key in definitions[kind.__name__].get("required", []) if key != "stage"
+    for cls in (*variants(Stage).values(), *variants(Step).values()):
+        definitions[cls.__name__]["properties"].pop("stage", None)
+        definitions[cls.__name__]["required"] = [
+            key for key in definitions[cls.__name__].get("required", []) if key != "stage"
         ]
     schema["properties"]["stages"]["items"] = _items(variants(Stage))
     schema["properties"]["prepare"]["items"] = _items(variants(Step))
     models: dict[str, type[Settings]] = {"matrix": Matrix, "execution": LocalExecution}
-    for key, kind in models.items():
-        definition = kind.model_json_schema()
-        definitions |= {**definition.pop("$defs", {}), kind.__name__: definition}
-        schema["properties"][key] = {"$ref": f"#/$defs/{kind.__name__}"}
+    for key, cls in models.items():
+        definition = cls.model_json_schema()
+        definitions |= {**definition.pop("$defs", {}), cls.__name__: definition}
+        schema["properties"][key] = {"$ref": f"#/$defs/{cls.__name__}"}
     for key, ending in ENDINGS.items():
         text = f"Values for the pipeline NAME{ending}, by keys as for --set; the comment above describes that pipeline."
         schema["properties"][key] = {"type": "object", "title": key.title(), "description": text}
@@ -110,23 +110,23 @@ def json_schema() -> dict[str, Any]:
         {"required": ["stages"]},
         {"required": ["matrix"], "properties": {"matrix": {"required": ["pipelines"]}}},
     ]
-    for kind in variants(Stage).values():
-        if issubclass(kind, Training):
-            definitions[kind.__name__]["properties"]["during"]["items"] = _items(variants(Scheduled), ["every"])
+    for cls in variants(Stage).values():
+        if issubclass(cls, Training):
+            definitions[cls.__name__]["properties"]["during"]["items"] = _items(variants(Scheduled), ["every"])
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def _items(stages: Mapping[str, type[Settings]], required: Sequence[str] = ()) -> dict[str, Any]:
     """Return the schema of the stages in a list.  Every stage also needs the `required` keys."""
-    names = sorted(name for name, kind in stages.items() if not required and not needs_settings(kind))
+    names = sorted(name for name, cls in stages.items() if not required and not needs_settings(cls))
     with_settings = [
         {
             "type": "object",
-            "properties": {name: _settings(kind.__name__, required, name in names)},
+            "properties": {name: _settings(cls.__name__, required, name in names)},
             "required": [name],
             "additionalProperties": False,
         }
-        for name, kind in stages.items()
+        for name, cls in stages.items()
     ]
     return {"oneOf": [*([{"enum": names}] if names else []), *with_settings]}
 

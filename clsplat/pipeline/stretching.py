@@ -21,13 +21,13 @@ from clsplat.stages.optimize import Optimize
 from clsplat.training.stage import Scheduled, Training
 
 Value = TypeVar("Value")
-Kind = TypeVar("Kind", bound=Training)
+TrainingT = TypeVar("TrainingT", bound=Training)
 MAX_STEP = 2**63 - 1  # the largest that a file can store
 PARTS = 10**6  # parts of a step; intervals are multiples of a part, which a file stores exactly
 
 
 @dataclass(frozen=True)
-class Axis:
+class StepScaling:
     """A mapping from steps to stretched steps: step x becomes floor(x * factor)."""
 
     exact: Fraction
@@ -36,8 +36,8 @@ class Axis:
     """Factor of all other steps: `exact`, rounded up to a multiple of 1 / PARTS."""
 
     @classmethod
-    def from_factor(cls, factor: float | Fraction) -> "Axis":
-        """Return the axis with a factor; a float is converted by its shortest decimal representation."""
+    def from_factor(cls, factor: float | Fraction) -> "StepScaling":
+        """Return the scaling by a factor; a float is converted by its shortest decimal representation."""
         exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
         return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))
 
@@ -136,51 +136,53 @@ def _stretch_stage(stage: Scheduled, pivot: int, factor: float) -> Scheduled:
     return stage.model_copy(update={"every": every, "start": start, "stop": stop})
 
 
-def map_trainings(settings: PipelineFile, kind: type[Kind], change: Callable[[Kind], Kind]) -> PipelineFile:
-    """Return settings with `change` applied to each training stage of a kind."""
-    stages = [change(stage) if isinstance(stage, kind) else stage for stage in settings.stages]
+def map_trainings(
+    settings: PipelineFile, cls: type[TrainingT], change: Callable[[TrainingT], TrainingT]
+) -> PipelineFile:
+    """Return settings with `change` applied to each training stage of a class."""
+    stages = [change(stage) if isinstance(stage, cls) else stage for stage in settings.stages]
     return settings.model_copy(update={"stages": stages})
 
 
 def stretch(value: Value, factor: float | Fraction) -> Value:
     """Return settings for `factor` times as many steps; the `step_keys` of each class are scaled."""
-    return _stretch(value, Axis.from_factor(factor))  # type: ignore[no-any-return]
+    return _stretch(value, StepScaling.from_factor(factor))  # type: ignore[no-any-return]
 
 
-def _stretch(value: Any, axis: Axis) -> Any:
+def _stretch(value: Any, scaling: StepScaling) -> Any:
     if isinstance(value, list):
         is_points = bool(value) and all(isinstance(item, list) for item in value)
-        return _points(value, axis) if is_points else [_stretch(item, axis) for item in value]
+        return _points(value, scaling) if is_points else [_stretch(item, scaling) for item in value]
     if isinstance(value, dict):
-        return {key: _stretch(entry, axis) for key, entry in value.items()}
+        return {key: _stretch(entry, scaling) for key, entry in value.items()}
     if not isinstance(value, Settings):
         return value
     fields = {name: getattr(value, name) for name in type(value).model_fields}
     keys = {key for base in type(value).__mro__ if issubclass(base, Settings) for key in base.step_keys}
     every = fields["every"] if "every" in keys else None
     new_fields = {
-        name: _steps(name, field, axis, every) if name in keys else _stretch(field, axis)
+        name: _steps(name, field, scaling, every) if name in keys else _stretch(field, scaling)
         for name, field in fields.items()
     }
-    rates = {name: new_fields[name] for name in type(value).rate_keys if axis.exact != 1}
-    new_fields |= {name: divide(rate, float(axis.exact)) for name, rate in rates.items()}
+    rates = {name: new_fields[name] for name in type(value).rate_keys if scaling.exact != 1}
+    new_fields |= {name: divide(rate, float(scaling.exact)) for name, rate in rates.items()}
     return value.model_copy(update={name: new for name, new in new_fields.items() if new is not fields[name]})
 
 
-def _steps(name: str, steps: Any, axis: Axis, every: Any) -> Any:
+def _steps(name: str, steps: Any, scaling: StepScaling, every: Any) -> Any:
     """Stretch the step number of a setting.  A start or stop stays between the same two multiples of `every`."""
     if not isinstance(steps, int | float) or steps == 0:
         return steps
     if name == "every":
-        return axis.scale_interval(steps)
+        return scaling.scale_interval(steps)
     if name == "steps":
-        return max(1, math.floor(steps * axis.exact))
-    scale_functions = {"start": axis.scale_start, "stop": axis.scale_stop, "until": axis.scale_until}
+        return max(1, math.floor(steps * scaling.exact))
+    scale_functions = {"start": scaling.scale_start, "stop": scaling.scale_stop, "until": scaling.scale_until}
     if name in scale_functions and every not in (None, 1):
         return scale_functions[name](int(steps), every)
-    return max(1, axis.scale(int(steps)))
+    return max(1, scaling.scale(int(steps)))
 
 
-def _points(points: list[list[float]], axis: Axis) -> list[list[float]]:
+def _points(points: list[list[float]], scaling: StepScaling) -> list[list[float]]:
     """Return the stretched points of a schedule; if two fall on one step, the later one is used."""
-    return [list(point) for point in {math.floor(step * axis.factor): value for step, value in points}.items()]
+    return [list(point) for point in {math.floor(step * scaling.factor): value for step, value in points}.items()]

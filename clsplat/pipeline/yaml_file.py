@@ -111,7 +111,7 @@ def _apply_variant(text: str, path: Path, file: Path, name: str) -> str:
             line = f"{file}:{document.line((name, key_path))}: {name}"
             raise ConfigError(f"{line}: the file has no key {quote(key_path)}; expected one of its keys, as for --set")
         edits.append((node.start_mark.index, node.end_mark.index, value))
-    next_start = len(text)  # start of the next edit: the end mark of a map is behind the comments that follow it
+    next_start = len(text)  # start of the next edit: the end mark of a map is after the comments that follow it
     for start, stop, new_text in sorted(edits, reverse=True):
         text = text[:start] + new_text + text[min(stop, next_start) :]
         next_start = start

@@ -248,17 +248,17 @@ def write_renders(
     canvas: Canvas,
     views: Sequence[View],
     out: Path,
-    kind: str,
+    file_format: str,
     layers: Sequence[str],
     photographs: Sequence[Path],
     is_video: bool = False,
 ) -> list[Path]:
-    """Write the layers of each view as images (`kind` png) or float32 arrays (npy); return the paths of the files.
+    """Write the layers of each view as images (png) or float32 arrays (npy); return the paths of the files.
 
     File names end in the name of the layer, except for color.  photographs: photo files, whose folders must not be
     written to.  is_video: whether the views are frames of a video; if so, frames of earlier videos are removed.
     """
-    color_paths = image_paths(out, [view.name for view in views], f".{kind}")
+    color_paths = image_paths(out, [view.name for view in views], f".{file_format}")
     files = [{layer: _layer_path(path, layer) for layer in layers} for path in color_paths]
     paths = [path for layer_files in files for path in layer_files.values()]
     if len(set(paths)) < len(paths):
@@ -267,18 +267,18 @@ def write_renders(
     names = [path.relative_to(out).as_posix() for path in paths]
     record = {**_read_record(out), **dict.fromkeys(names, is_video)}
     _write_record(out, record)
-    has_range = kind == "png" and not DEPTH_LAYERS.isdisjoint(layers)
+    has_range = file_format == "png" and not DEPTH_LAYERS.isdisjoint(layers)
     depths = canvas.depth_range(views) if has_range else (0.0, 0.0)
     for view, layer_files in counted(zip(views, files, strict=True), "views rendered", len(views)):
         buffers = canvas.render_layers(view, layers)
         for layer, path in layer_files.items():
-            if kind == "png":
+            if file_format == "png":
                 write_image(path, layer_image(buffers, layer, depths))
             else:
                 _write_array(path, layer_values(buffers, layer))
     if is_video:
         _remove_frames(
-            out, {name for name, is_frame in record.items() if is_frame and name.endswith(f".{kind}")} - {*names}
+            out, {name for name, is_frame in record.items() if is_frame and name.endswith(f".{file_format}")} - {*names}
         )
     return paths
 
@@ -370,9 +370,9 @@ class ModelFile:
         return make_painter(self.host_model, self.device, self.background)
 
     def render(
-        self, split: str, out: Path, kind: str, layers: Sequence[str] = LAYERS[:1], time: float | None = None
+        self, split: str, out: Path, file_format: str, layers: Sequence[str] = LAYERS[:1], time: float | None = None
     ) -> int:
-        """Render the views of a split, and write their layers as images (`kind` png) or float32 arrays (npy).
+        """Render the views of a split, and write their layers as images (png) or float32 arrays (npy).
 
         time: timestamp in [0, 1] for all views; None: use the timestamp of each view.  Returns the number of files.
         """
@@ -383,7 +383,7 @@ class ModelFile:
         if not views:
             raise DataError(f"{self.scene.path}: has no {split} views")
         images = [view.image_path for split in ("train", "test") for view in self.photographs.split(split)]
-        return len(write_renders(Canvas(self.painter), views, out, kind, layers, images))
+        return len(write_renders(Canvas(self.painter), views, out, file_format, layers, images))
 
     def evaluate(
         self, downscales: Sequence[float] | None = None, perceptual: Perceptual = PSNR_AND_SSIM
@@ -403,7 +403,7 @@ class ModelFile:
                         train_views=scene.split("train"),
                     )
                     metrics[split][f"{downscale:g}"] = mean(results, perceptual)
-        return {**metrics, **_count_parameters(self.host_model), "device": self.device.text}
+        return {**metrics, **_count_parameters(self.host_model), "device": self.device.label}
 
 
 def write_cameras(scene: Path | Scene, out: Path, format_: str, images: str = "none") -> list[Path]:

@@ -118,7 +118,7 @@ def open_run(
     """
     opened_device, planned_steps = check_start(pipeline, out, device, start)
     if status:
-        status.enter("preparing", device=opened_device.text)
+        status.enter("preparing", device=opened_device.label)
     status = status or StatusFile(out)
     if any(step.reason for step in planned_steps):
         names = photo_names(pipeline, planned_steps, out)

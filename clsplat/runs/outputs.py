@@ -49,7 +49,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         "cpu_seconds": round(run.cpu_seconds, 3),
         "device_memory": run.device.peak,
         "seed": run.seed,
-        "device": run.device.text,
+        "device": run.device.label,
         "pipeline": run.name,
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "scene": str(run.scene.path.resolve()),

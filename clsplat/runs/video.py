@@ -57,7 +57,7 @@ class VideoTarget:
 
     video: Path | None  # the video file; None: write images
     out: Path = Path("renders")  # folder of the images
-    kind: str = "png"  # file format of the images, one of FORMATS
+    file_format: str = "png"  # file format of the images, one of FORMATS
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,10 @@ def make_video(
     """
     start_time = time.perf_counter()
     videos = layer_files(target.video, extras.layers) if target.video else {}
-    if target.kind not in FORMATS:
-        raise ConfigError(f"--format: expected {' or '.join(FORMATS)}, got '{target.kind}'")
-    if videos and target.kind != FORMATS[0]:
-        raise ConfigError(f"--format {target.kind} is for images, and a video has 8 bits; omit --video")
+    if target.file_format not in FORMATS:
+        raise ConfigError(f"--format: expected {' or '.join(FORMATS)}, got '{target.file_format}'")
+    if videos and target.file_format != FORMATS[0]:
+        raise ConfigError(f"--format {target.file_format} is for images, and a video has 8 bits; omit --video")
     if extras.side and not videos:
         raise ConfigError("--side needs --video, because images are written without a comparison; add --video FILE")
     content = _read(model)
@@ -105,7 +105,9 @@ def make_video(
         photo_files = [view.image_path for view in used_scene.views] if used_scene else []
         is_still = request.frames == 1 and request.path == "fixed"
         views = [replace(plan.views[0], name=STILL)] if is_still else plan.views
-        files = write_renders(canvas, views, target.out, target.kind, extras.layers, photo_files, is_video=not is_still)
+        files = write_renders(
+            canvas, views, target.out, target.file_format, extras.layers, photo_files, is_video=not is_still
+        )
     else:
         side = _make_side(extras.side, plan, used_scene, background, opened_device, origin)
         render_video(canvas, plan, videos, side, lambda views: counted(views, "frames rendered", len(views)))

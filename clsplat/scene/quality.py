@@ -22,7 +22,7 @@ MAX_POINTS = 10_000  # of a cloud, used to estimate depths
 class Measures:
     """Measurements of the photographs before training."""
 
-    photographs: int
+    photograph_count: int
     """Number of training photos, including those for validation."""
     reprojection_error: float | None = None
     """Mean reprojection error of the points, px at the training resolution; None: unknown."""

@@ -27,7 +27,7 @@ AIMED_COSINE = 0.8  # mean cosine between camera axes and the directions to the 
 MIN_OFFSET = 0.3  # of the distance to the center, perpendicular to the upward axis: cameras surround the center
 MIN_GAP = 40.0  # degrees around the center without a photo
 OPEN_SIDE = 120.0  # degrees; a wider gap is a side that was left out on purpose
-UNEVEN = 3.0  # times the median gap
+MIN_GAP_RATIO = 3.0  # to the median gap
 
 
 def collect_advice(run: Run, is_overfit: bool) -> list[str]:
@@ -114,7 +114,7 @@ def advise_on_capture(train: Sequence[View], views: Sequence[View], rerun: str) 
         yield f"only {count}; show every part of the scene in at least five, from several sides, then `{rerun}`"
     if gap := find_widest_gap(views):
         degrees, first, second = gap
-        yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take some there, then `{rerun}`"
+        yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take photos there, then `{rerun}`"
 
 
 def find_outliers(psnr: Mapping[str, float]) -> list[str]:
@@ -142,7 +142,7 @@ def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
     gaps = np.degrees(np.diff(np.append(angles[order], angles[order[0]] + 2 * np.pi)))
     inner_gaps = np.where(gaps < OPEN_SIDE, gaps, 0.0)
     index = int(np.argmax(inner_gaps))
-    if inner_gaps[index] < max(MIN_GAP, UNEVEN * float(np.median(gaps))):
+    if inner_gaps[index] < max(MIN_GAP, MIN_GAP_RATIO * float(np.median(gaps))):
         return None
     return float(gaps[index]), views[order[index]].name, views[order[(index + 1) % len(views)]].name
 

@@ -136,8 +136,8 @@ class Checkpoint(Scheduled):
     """Number of checkpoints to keep; older ones are removed."""
 
     every_seconds: Annotated[float, Field(gt=0)] | None = None
-    """Seconds without a checkpoint after which another one is saved, in addition to `every`; this does not affect the
-    bits."""
+    """Age of the last checkpoint, in seconds, at which another one is saved, in addition to `every`; the bits of the
+    model do not depend on it."""
 
     def is_overdue(self, run: Run) -> bool:
         return self.every_seconds is not None and time.monotonic() - run.status.saved_at >= self.every_seconds

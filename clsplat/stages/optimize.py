@@ -187,15 +187,15 @@ class ValidatedTraining(Training):
         LOG.info("%s", run.best.text())
 
 
-def comparable_psnr(measured: Sequence[Mapping[str, Any]]) -> list[float | None]:
+def comparable_psnr(averages: Sequence[Mapping[str, Any]]) -> list[float | None]:
     """Return the PSNR of each average in dB, or None if it was not measured.
 
     The PSNR after color fitting is used if all averages have this value for all their views.
     """
     has_color = all(
-        average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in measured
+        average.get("psnr_color") is not None and "psnr_color_reason" not in average for average in averages
     )
-    return [average.get("psnr_color" if has_color else "psnr") for average in measured]
+    return [average.get("psnr_color" if has_color else "psnr") for average in averages]
 
 
 def _validates(stage: Scheduled) -> bool:

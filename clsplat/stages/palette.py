@@ -33,7 +33,7 @@ BLOCK = 1 << 16  # points on the device at a time, since points have many compon
 VECTORS_PER_LAUNCH = 1024  # vectors per kernel launch, which fit in the cache of a core
 Floats = NDArray[np.float64]
 Nearest = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]
-UNSEEN = 0.05  # weight of all directions together relative to the observed ones; 0.01 to 0.05 give lego the same errors
+UNSEEN = 0.05  # weight of all directions relative to the observed ones; 0.01 to 0.05 give lego the same errors
 FAINT = 1.0e-3  # weight of a Gaussian that no view shows, as a fraction of the mean weight
 ROUNDS = 4  # iterations of Lloyd's algorithm; a fifth lowers the error of lego by 0.6 %
 
@@ -113,9 +113,8 @@ def _find_most_similar(device: Device, points: NDArray[np.float32], vectors: NDA
     planes = np.zeros((components, stride), np.float32)
     planes[:, :count] = points.T
     entries = -(-len(vectors) // TOGETHER) * TOGETHER
-    host_vectors = np.concatenate(
-        [vectors, np.repeat(vectors[:1], entries - len(vectors), axis=0)]
-    )  # of equal ones, the first is chosen
+    # padded with copies of the first vector, which are never chosen, since the first of equal vectors is
+    host_vectors = np.concatenate([vectors, np.repeat(vectors[:1], entries - len(vectors), axis=0)])
     label, largest = device.empty(stride), device.empty(stride)
     device_points, all_vectors = device.upload(planes), device.upload(np.ascontiguousarray(host_vectors, np.float32))
     for first in range(0, entries, VECTORS_PER_LAUNCH):

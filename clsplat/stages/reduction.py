@@ -95,7 +95,7 @@ class PruneLeast(Scheduled):
         run.records.add(run.step, "densify", **asdict(change))
         lost_percent = 100 * (1 - score[rows].sum() / (score.sum() or 1))
         LOG.info(
-            "%s Gaussians kept; the others had %.2g %% of the %s",
+            "%s Gaussians kept; the removed ones had %.2g %% of the total %s",
             f"{len(rows):,} of {len(score):,}",
             lost_percent,
             self.score,

@@ -253,7 +253,7 @@ class HtmlReport(Stage):
         page = render(
             "report.html.j2",
             title=run.scene_name,
-            subtitle=f"{run.name} · {run.device.text}",
+            subtitle=f"{run.name} · {run.device.label}",
             main=_headline(run),
             overfitting_note=overfitting_note(run),
             advice=sentences,

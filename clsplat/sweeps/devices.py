@@ -93,7 +93,7 @@ def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) 
     slots = []
     for info, core_sets in zip(subset, split_device_cores(subset, packing), strict=True):
         bits, memory = bits_class(info, infos), info.memory // len(core_sets)
-        slot = DeviceSlot(worker, device_query(info, infos), bits, info.text, memory=memory)
+        slot = DeviceSlot(worker, device_query(info, infos), bits, info.label, memory=memory)
         slots += [replace(slot, cores=cores) for cores in core_sets]
     return slots
 
@@ -110,16 +110,16 @@ def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
 
     Raises DeviceError if the fixed run fails.
     """
-    key = hash_values(Owner.current().host, info.text, info.driver, code_digest(), shipped_pipelines()[PIPELINE])
+    key = hash_values(Owner.current().host, info.label, info.driver, code_digest(), shipped_pipelines()[PIPELINE])
     cache_file = cache_folder() / "bits" / f"{key[:16]}.json"
     with suppress(DataError):
         values = read_json(cache_file)
         if isinstance(values, dict) and isinstance(values.get("bits"), str):
             return str(values["bits"])
-    LOG.info("%s: running a short test to find devices that produce the same bits", info.text)
+    LOG.info("%s: running a short test to find devices that produce the same bits", info.label)
     bits = _hash_fixed_run(device_query(info, infos))
     with suppress(OutputError):
-        write_text(cache_file, json.dumps({"bits": bits, "device": info.text}) + "\n")
+        write_text(cache_file, json.dumps({"bits": bits, "device": info.label}) + "\n")
     return bits
 
 

@@ -379,7 +379,7 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
             continue
         changes = _record_changes(run, path, state)
         remarks = [f"{text}; from here on, bits differ from a run without this change" for text in changes]
-        if state.device != run.device.text:
+        if state.device != run.device.label:
             remarks.append(f"the run was started on {state.device}; from here on, bits may differ")
         _restore(run, state, tables)
         return path, remarks
@@ -436,7 +436,7 @@ def _write(run: Run, prefix: str) -> Path:
         records=run.records.line_count if run.stage_step else run.records.line_count_at_stage,
         model_hashes=run.model_hashes,
         changes=run.changes,
-        device=run.device.text,
+        device=run.device.label,
         inputs=run.inputs,
         file_hashes=run.file_hashes,
         pipeline=run.pipeline,

@@ -90,13 +90,13 @@ def test_resume_and_dry_run(runs, tiny_scene, tmp_path):
 @pytest.mark.parametrize("kind", ["png", "npy"])
 def test_renders(runs, tmp_path, kind):
     command("render", runs[0], "--out", tmp_path / "command", "--format", kind, "--scale", 2)
-    assert clsplat.render_views(runs[0], out=tmp_path / "function", kind=kind, downscale=2) == 2
+    assert clsplat.render_views(runs[0], out=tmp_path / "function", format=kind, downscale=2) == 2
     assert sorted(contents(tmp_path / "command")) == [".renders.json", *(f"test/r_00{i}.{kind}" for i in (0, 1))]
     assert contents(tmp_path / "command") == contents(tmp_path / "function")
 
 
 def test_rendered_files_match_the_renderer(runs, tiny_scene, tmp_path):
-    clsplat.render_views(runs[0], out=tmp_path, kind="npy")
+    clsplat.render_views(runs[0], out=tmp_path, format="npy")
     renderer = clsplat.Renderer(clsplat.load(runs[0]))
     for view in clsplat.read_scene(tiny_scene).split("test"):
         np.testing.assert_array_equal(np.load(tmp_path / f"{view.name}.npy"), renderer.render(view).image)
@@ -133,7 +133,7 @@ def test_pages(runs, tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"kind": "jpg"}, "^kind: expected one of png, npy, got 'jpg'$"),
+        ({"format": "jpg"}, "^format: expected one of png, npy, got 'jpg'$"),
         ({"split": "bogus"}, "^split: expected one of train, test, all, got 'bogus'$"),
     ],
 )

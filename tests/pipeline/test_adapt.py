@@ -25,8 +25,8 @@ class Counted(Adaptation):
     key: str = "model.sh_degree"
 
     def decide(self, training, measures):
-        degree = 1 if measures.photographs >= 8 else 0
-        yield Decision(key=self.key, value=degree, reason=f"{measures.photographs} photos")
+        degree = 1 if measures.photograph_count >= 8 else 0
+        yield Decision(key=self.key, value=degree, reason=f"{measures.photograph_count} photos")
         yield Decision(key="optimize.modules.dropout", value={"probability": 0.1}, reason="so it is")
 """
 ADAPT = "adapt=counted"

@@ -13,7 +13,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import fire_steps, fires_at
 from clsplat.pipeline.file import PipelineFile
 from clsplat.pipeline.loading import load
-from clsplat.pipeline.stretching import Axis, last_edit, min_steps, stretch_to_steps, with_steps
+from clsplat.pipeline.stretching import StepScaling, last_edit, min_steps, stretch_to_steps, with_steps
 from clsplat.training.stage import Training
 from tests.support.pipelines import SCHEDULED
 
@@ -66,7 +66,7 @@ def test_stretched_pipeline_stretches_again_with_its_own_edits(name, data):
 def test_in_fewer_steps_edits_coincide_but_keep_their_order(name, data):
     recipe, old = recipe_and_edits(name)
     steps = data.draw(st.integers(1, min_steps(recipe.training)))
-    factor = Axis.from_factor(Fraction(steps, recipe.training.steps)).factor
+    factor = StepScaling.from_factor(Fraction(steps, recipe.training.steps)).factor
     old, new = (
         {(step, place) for step, place in item if place != -1}  # at least one change of the size stays
         for item in (old, edits(stretch_to_steps(recipe, steps).training, recipe.training))

@@ -13,7 +13,7 @@ from tests.support.models import model_of
 
 WORK = {
     "png": lambda file, scene, out: clsplat.render_views(file, scene, out),
-    "npy": lambda file, scene, out: clsplat.render_views(file, scene, out, kind="npy"),
+    "npy": lambda file, scene, out: clsplat.render_views(file, scene, out, format="npy"),
     "evaluate": lambda file, scene, out: clsplat.evaluate(file, scene),
 }
 

@@ -83,7 +83,7 @@ def test_unprepared_photographs_give_the_training_count(photos, sets, training):
     out = photos.parent / "runs" / "a"
     names = photo_names(pipeline, pipeline.preparation(out), out)
     assert len(names) == COUNT
-    assert expected_measures(pipeline, names).photographs == training
+    assert expected_measures(pipeline, names).photograph_count == training
     assert expected_measures(pipeline, []) is None
 
 

@@ -16,7 +16,7 @@ from tests.support.outdoor_scene import Yard
 
 def test_each_training_view_counts_once(tiny_scene):
     scene = read_scene(tiny_scene)
-    assert measure_scene(scene.downscaled(1, 2)).photographs == len(scene.split("train"))
+    assert measure_scene(scene.downscaled(1, 2)).photograph_count == len(scene.split("train"))
 
 
 def test_nearest_points_are_in_front_of_training_views(tiny_scene):

@@ -78,7 +78,7 @@ def test_frames_can_be_written_as_images(few_steps, tiny_scene, tmp_path):
     out, options = tmp_path / "out", {"video": None, "out": tmp_path / "out", "size": (16, 16)}
     clsplat.render_path(few_steps, **options, frames=5, depth=True)
     clsplat.render_views(few_steps, out=out)
-    clsplat.render_path(few_steps, **options, frames=1, kind="npy")
+    clsplat.render_path(few_steps, **options, frames=1, format="npy")
     (out / "frame_00007.png").write_bytes(b"a drawing")
     renders = [path.relative_to(tiny_scene).as_posix() for path in sorted((tiny_scene / "test").glob("*.png"))]
     clsplat.render_path(few_steps, **options, frames=2)
@@ -163,7 +163,7 @@ def test_another_model_is_shown_next_to_it(few_steps, tmp_path):
 def test_depth_and_coverage_are_images_and_arrays(few_steps, tmp_path):
     count = clsplat.render_views(few_steps, out=tmp_path / "png", depth=True, alpha=True)
     assert count == 6 == len(pictures(tmp_path / "png"))
-    clsplat.render_views(few_steps, out=tmp_path / "npy", kind="npy", depth=True, alpha=True)
+    clsplat.render_views(few_steps, out=tmp_path / "npy", format="npy", depth=True, alpha=True)
     depth, alpha = (np.load(tmp_path / "npy" / "test" / f"r_000_{name}.npy") for name in ("depth", "alpha"))
     assert depth.shape == alpha.shape == (40, 40)
     assert 0 <= alpha.min() < 0.1

@@ -142,4 +142,4 @@ def measure(
     cases = {name: make_case(bench_device, *SIZES[name], settings) for name in scenes}
     if model is not None and scene is not None:
         cases[model.stem] = load_case(bench_device, model, scene, settings)
-    return Measurement(bench_device.text, settings.name, peaks, run_bench(cases, peaks, repeats))
+    return Measurement(bench_device.label, settings.name, peaks, run_bench(cases, peaks, repeats))
