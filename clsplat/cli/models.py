@@ -220,7 +220,7 @@ def align(
     as_json: JsonOption = False,
 ) -> None:
     """Give a scene or a model its true scale, up direction, or map coordinates, and print the remaining errors."""
-    from clsplat.workflows.align import table
+    from clsplat.workflows.align import format_table
 
     if as_json:
         terminal.keep_stdout_for_json()
@@ -239,7 +239,7 @@ def align(
         terminal.show_json(result)
         return
     if result["points"] or result["distances"]:
-        terminal.show(table(result))
+        terminal.show(format_table(result))
     rms = (
         ""
         if result["rms"] is None
@@ -278,11 +278,11 @@ def compress(
     device: DeviceOption = None,
 ) -> None:
     """Prune, train, and quantize a model to meet a target size or quality; each file is measured as written."""
-    from clsplat.workflows.compress import table
+    from clsplat.workflows.compress import format_table
 
     keeps = _parse_numbers("--keep", keep, "fractions, separated by commas, such as 1,0.7,0.5")
     result = commands.compress_model(model, scene, target, out, format=format_, keep=keeps, steps=steps, device=device)
-    terminal.show(table(result))
+    terminal.show(format_table(result))
     best, source = result["chosen"], result["source"]
     size = f"{best['bytes'] / 1e6:.3g} MB, {best['bytes'] / source['bytes']:.1%} of the model"
     terminal.print_message(
@@ -310,12 +310,12 @@ def lod(
     device: DeviceOption = None,
 ) -> None:
     """Write a model at several levels of detail for the web (streamed SOG).  With photos, train each level."""
-    from clsplat.workflows.lod import table
+    from clsplat.workflows.lod import format_table
 
     result = commands.write_levels(
         model, folder, scene, levels=levels, keep=keep, steps=steps, downscale=downscale, device=device
     )
-    terminal.show(table(result))
+    terminal.show(format_table(result))
     note = f"; PSNR of {result['split']} views, not yet quantized" if result["split"] else ""
     terminal.print_message(f"{result['folder']}/lod-meta.json: {result['bytes'] / 1e6:.3g} MB{note}")
 

@@ -280,7 +280,7 @@ def blocks(
     device: DeviceOption = None,
 ) -> None:
     """Train a large scene in blocks that fit the device, one by one or on several devices, and merge them."""
-    from clsplat.workflows.blocks import table
+    from clsplat.workflows.blocks import format_table
 
     if as_json:
         terminal.keep_stdout_for_json()
@@ -301,7 +301,7 @@ def blocks(
     if as_json:
         terminal.show_json(result)
         return
-    terminal.show(table(result))
+    terminal.show(format_table(result))
     if plan:
         terminal.print_message(f"{out}/partition.json: the plan; run the command without --plan to train the blocks")
     else:

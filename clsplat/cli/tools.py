@@ -83,7 +83,7 @@ def inspect(
 ) -> None:
     """Report problems of a dataset or photos, and whether training can use them; exit code 3 if not."""
     from clsplat.prepare.inspect.findings import show
-    from clsplat.workflows.blocks import table
+    from clsplat.workflows.blocks import format_table
 
     if count is None and device is not None:
         raise ConfigError("inspect: --device has no effect without --blocks; add --blocks or omit --device")
@@ -96,7 +96,7 @@ def inspect(
         if as_json:
             terminal.show_json(plan)
         else:
-            terminal.show(table(plan))
+            terminal.show(format_table(plan))
             terminal.print_message(POINTS_NOTE)
         return
     inspection = tools.inspect_scene(scene, page)

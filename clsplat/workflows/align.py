@@ -50,15 +50,15 @@ class AlignOptions:
 
 
 @dataclass(frozen=True)
-class Subject:
-    """The scene, the model, or both that are to be aligned.  Their coordinates are relative to the same origin."""
+class AlignInput:
+    """The scene, the model, or both, that are aligned.  Their coordinates are relative to the same origin."""
 
     path: Path
     scene: Scene | None = None
     model: Model | None = None
 
     @classmethod
-    def read(cls, path: Path, scene: Path | None, needs_model: bool) -> "Subject":
+    def read(cls, path: Path, scene: Path | None, needs_model: bool) -> "AlignInput":
         """Read a dataset folder, a run folder, or a model file.
 
         scene: the dataset folder of a model; default: that of its run, if any; must be None if `path` is a dataset
@@ -126,23 +126,26 @@ class Alignment:
     epsg: int | None = None  # of coordinates from GPS
 
     @classmethod
-    def solve(cls, subject: Subject, options: AlignOptions) -> "Alignment":
-        """Find the transform.  Raises ConfigError, DataError."""
+    def solve(cls, inputs: AlignInput, options: AlignOptions) -> "Alignment":
+        """Return the transform that meets the options.
+
+        Raises ConfigError for options that need a scene, and DataError for too few or contradictory measurements.
+        """
         points = read_control(options.control) if options.control else {}
         bars = [ScaleBar.parse(text, points) for text in options.distances]
-        bar_lengths = np.array([bar.measure(subject.scene) for bar in bars])
+        bar_lengths = np.array([bar.measure(inputs.scene) for bar in bars])
         lengths = np.array([bar.length for bar in bars])
         scale = float(lengths @ bar_lengths / (bar_lengths @ bar_lengths)) if bars else None
-        up, anchor, height = subject.up(options.level) if options.level else (UP, np.zeros(3), None)
-        targets = _gps_targets(subject) if options.gps else _control_targets(subject, options.control, points)
+        up, anchor, height = inputs.up(options.level) if options.level else (UP, np.zeros(3), None)
+        targets = _gps_targets(inputs) if options.gps else _control_targets(inputs, options.control, points)
         if targets.names:
             known_up = up if options.level else None
-            fit = Correspondences(targets.source + subject.origin, targets.target, scale, known_up)
+            fit = Correspondences(targets.source + inputs.origin, targets.target, scale, known_up)
             transform, is_outlier = fit.fit_inliers()
-            residuals = targets.residuals(transform, subject.origin, is_outlier)
+            residuals = targets.residuals(transform, inputs.origin, is_outlier)
         elif bars or options.level:
-            height = None if height is None else height + float(up @ subject.origin)
-            transform, residuals = level(up, anchor + subject.origin, height, scale or 1.0), []
+            height = None if height is None else height + float(up @ inputs.origin)
+            transform, residuals = level(up, anchor + inputs.origin, height, scale or 1.0), []
         else:
             raise DataError(f"{options.control}: no point has x, y, and z; add them, or use --distance between points")
         rows = [
@@ -167,7 +170,7 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Targets:
-    """Points with known coordinates."""
+    """N points: their positions in the scene, `source`, and their known coordinates, `target`."""
 
     names: list[str]
     source: Floats  # [N, 3], relative to the origin of the scene
@@ -190,20 +193,20 @@ class Targets:
         return residuals
 
 
-def _gps_targets(subject: Subject) -> Targets:
+def _gps_targets(inputs: AlignInput) -> Targets:
     """Return the cameras with GPS positions.  Raises ConfigError, DataError."""
-    gps = GpsPositions.from_scene(subject.require_scene("--gps"))
+    gps = GpsPositions.from_scene(inputs.require_scene("--gps"))
     source = np.stack([view.position for view in gps.views]).astype(np.float64)
     LOG.info("%d photos have a GPS position; coordinates are UTM, EPSG:%d", len(gps.views), gps.epsg)
     return Targets([view.name for view in gps.views], source, gps.positions, [[] for _ in gps.views], gps.epsg)
 
 
-def _control_targets(subject: Subject, file: Path | None, points: Mapping[str, MarkedPoint]) -> Targets:
+def _control_targets(inputs: AlignInput, file: Path | None, points: Mapping[str, MarkedPoint]) -> Targets:
     """Return the points with known coordinates, located in the scene.  Raises ConfigError, DataError."""
     controls = [point for point in points.values() if point.coordinates is not None]
     if not controls:
         return Targets([], np.zeros((0, 3)), np.zeros((0, 3)), [])
-    scene = subject.require_scene("--control")
+    scene = inputs.require_scene("--control")
     try:
         located = [point.locate(scene) for point in controls]
     except DataError as error:
@@ -220,31 +223,31 @@ def align(
     format_: str = "colmap",
     images: str = "copy",
 ) -> dict[str, Any]:
-    """Align a scene, a run, or a model file.  The name of `out` decides what is written: a model file, or cameras.
+    """Align a scene, a run, or a model file.  The name of `out` selects the output: a model file, or cameras.
 
     Returns the alignment as JSON values, and `files`.  Raises ClsplatError.
     """
     is_model = format_from_name(out) is not None
-    subject = Subject.read(path, scene, is_model)
+    inputs = AlignInput.read(path, scene, is_model)
     if not is_model:
-        if subject.scene is None:
+        if inputs.scene is None:
             raise ConfigError(f"{out}: is the name of a folder, and {path} is a model; use a name that ends in .ply")
-        alignment = Alignment.solve(subject, options)
-        files = write_cameras(alignment.transform.transform_scene(subject.scene), out, format_, images)
+        alignment = Alignment.solve(inputs, options)
+        files = write_cameras(alignment.transform.transform_scene(inputs.scene), out, format_, images)
         return {**alignment.data(), "files": [str(file) for file in files]}
-    if subject.model is None:
+    if inputs.model is None:
         raise ConfigError(f"{out}: is the name of a model, and {path} is a scene; use the name of a folder")
     check_output([path], out)
-    alignment = Alignment.solve(subject, options)
+    alignment = Alignment.solve(inputs, options)
     transform = alignment.transform
     try:
-        model = subject.model.transformed(transform.scale, transform.rotation, transform.translation)
+        model = inputs.model.transformed(transform.scale, transform.rotation, transform.translation)
     except ValueError as error:
         raise DataError(f"{path}: {error}") from error
     return {**alignment.data(), "files": [write_model([path], model, out, WriteOptions())["file"]]}
 
 
-def table(result: Mapping[str, Any]) -> str:
+def format_table(result: Mapping[str, Any]) -> str:
     """Format the errors of the points and distances of an alignment as a text table."""
     rows = [["point", "dx", "dy", "dz", "distance", "pixels", ""]] if result["points"] else []
     for point in result["points"]:

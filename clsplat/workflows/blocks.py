@@ -138,11 +138,12 @@ class Blocks:
             )
         rasterizer = self.pipeline.settings.rasterizer
         self.device = open_verified(device, rasterizer.schedule, rasterizer.sort)
-        self.scene = read_run_scene(self.pipeline.settings.scene, self.pipeline.settings.scene.folder)
+        self.run_scene = read_run_scene(self.pipeline.settings.scene, self.pipeline.settings.scene.folder)
         # a block has other photos, and would choose another near plane
-        self.pipeline = with_lengths(self.pipeline, self.scene.scene)
-        if len(self.scene.original.downscales) > 1:
-            raise DataError(f"{self.scene.original.path}: has photos in several sizes; blocks need a single size")
+        self.pipeline = with_lengths(self.pipeline, self.run_scene.scene)
+        if len(self.run_scene.original.downscales) > 1:
+            path = self.run_scene.original.path
+            raise DataError(f"{path}: has photos in several sizes; blocks need a single size: resize the photos")
 
     def identity(self) -> dict[str, Any]:
         """Return the inputs that identify the work: options, and hashes of the photos, pipelines, and coarse model."""
@@ -153,7 +154,7 @@ class Blocks:
         digests = {name: hashlib.sha256(text.encode()).hexdigest() for name, text in contents.items()}
         options = {"blocks": self.plan.blocks, "min_coverage": self.plan.min_coverage, "steps": self.plan.steps}
         model = {"model": sha256(self.coarse_file)} if self.coarse_file else {}
-        return {**options, "photographs": self.scene.identity.digest, **model, **digests}
+        return {**options, "photographs": self.run_scene.identity.digest, **model, **digests}
 
     def partition(self) -> Partition:
         """Train the coarse model if necessary, partition it, and write the manifest."""
@@ -162,9 +163,10 @@ class Blocks:
             LOG.info("training the coarse model")
             file = raw_model(train_in_folder(self.coarse, self.out / COARSE, self.device))
         assert file is not None
-        model = load_model(file).in_scene(self.scene.scene)
-        photographs = Photographs(self.device, self.scene.background, budget=0)  # each photo is used once per pass
-        partitioner = Partitioner(model, self.scene.scene, self.device, photographs)
+        scene, background = self.run_scene.scene, self.run_scene.background
+        model = load_model(file).in_scene(scene)
+        photographs = Photographs(self.device, background, budget=0)  # each photo is used once per pass
+        partitioner = Partitioner(model, scene, self.device, photographs)
         partition = partitioner.partition(self.plan.blocks, sha256(file), self.plan.min_coverage)
         partition.write(self.out)
         return partition
@@ -172,7 +174,7 @@ class Blocks:
     def plan_data(self, partition: Partition) -> dict[str, Any]:
         """Return the manifest with the estimated training time of each block."""
         pipelines = {block.name: self.block_pipeline(block, partition) for block in partition.blocks}
-        sizes = sorted((view.camera.width, view.camera.height) for view in self.scene.scene.split("train"))
+        sizes = sorted((view.camera.width, view.camera.height) for view in self.run_scene.scene.split("train"))
         units, size = self.device.info.units, sizes[len(sizes) // 2]
         data, times = partition.data(), block_seconds(partition.blocks, pipelines, size, units)
         return {**data, "blocks": [{**block, "seconds": times[block["name"]]} for block in data["blocks"]]}
@@ -287,7 +289,7 @@ TIME_HEADING = "estimated time"
 NOTE = "memory is at the start of training; times range from no growth to growth up to an estimated maximum"
 
 
-def table(manifest: dict[str, Any]) -> str:
+def format_table(manifest: dict[str, Any]) -> str:
     """Format a manifest as a text table.  The column `initial MiB` is the device memory at the start of training.
 
     Training times, if there are any, are ranges: from no growth to growth up to the maximum number of Gaussians.

@@ -29,8 +29,8 @@ from clsplat.workflows.finetune import Measurer, Tuning, claim_folder, require_s
 STAGES = ("init", "prune_least", "optimize")  # of the recipe; each rung writes a PLY
 PALETTE = "palette_sh"
 # stages that train the SH palette of a SOG, round all tables, and fine-tune the rounded tables
-VECTORS = ("reduce_sh", PALETTE, "optimize", "share_palette", PALETTE)
-SOG_STAGES = ("init", *VECTORS, "round_tables", "optimize", "round_tables")
+PALETTE_STAGES = ("reduce_sh", PALETTE, "optimize", "share_palette", PALETTE)
+SOG_STAGES = ("init", *PALETTE_STAGES, "round_tables", "optimize", "round_tables")
 SOG_FOLDER, SOG = "fitted", "model.sog"
 
 
@@ -180,7 +180,7 @@ def cells(entry: Entry, source: Entry) -> list[str]:
     ]
 
 
-def table(result: dict[str, Any]) -> str:
+def format_table(result: dict[str, Any]) -> str:
     """Format the record of a search as text; a star marks the best file."""
     source, entries = Entry(**result["source"]), [Entry(**entry) for entry in result["points"]]
     best_entry = result["chosen"] and Entry(**result["chosen"])

@@ -62,7 +62,7 @@ class Tuning:
         data = read_yaml(path).data
         stage_data = [*_select_stages(data["stages"], stages), {"export": {"file": MODEL, "sky": "sidecar", **export}}]
         document = Document({**data, "name": self.name, "stages": stage_data})
-        settings = {**self._scene(), **self._rendering(), **values}
+        settings = {**self._scene_settings(), **self._rendering_settings(), **values}
         pipeline = check_document(path, document, [f"{key}={json.dumps(value)}" for key, value in settings.items()])
         if self.steps is None:
             return pipeline
@@ -70,10 +70,10 @@ class Tuning:
         return replace(pipeline, settings=stretch(pipeline.settings, Fraction(self.steps, recipe_steps)))
 
     def train(self, pipeline: Pipeline, folder: Path, file: str = MODEL) -> Path:
-        """Call `train_in_folder` with the device of this tuning."""
+        """Call `train_in_folder` with the device of the model."""
         return train_in_folder(pipeline, folder, self.device, file)
 
-    def _scene(self) -> dict[str, Any]:
+    def _scene_settings(self) -> dict[str, Any]:
         settings, rendering = self.source.settings, self.model.rendering
         return {
             "scene.path": str(self.source.folder.resolve()),
@@ -83,7 +83,7 @@ class Tuning:
             "scene.background": rendering.background or settings.background,
         }
 
-    def _rendering(self) -> dict[str, Any]:
+    def _rendering_settings(self) -> dict[str, Any]:
         rendering = self.model.rendering
         screen = {"type": "dilation", "variance": rendering.screen_variance, "compensate": int(rendering.compensate)}
         if rendering.pixel_box:

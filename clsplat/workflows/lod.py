@@ -131,7 +131,7 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
 
 def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
     """Return disjoint pairs of rows, the cheapest first.  There is at least one pair if there are at least two rows."""
-    first, second = _neighbors(tables["means"])
+    first, second = _find_neighbors(tables["means"])
     cost = pair_cost(tables, first, second)
     order = np.lexsort((second, first, np.where(np.isfinite(cost), cost, np.inf)))
     is_free = bytearray(b"\1") * len(tables["means"])
@@ -164,7 +164,7 @@ def _block_cost(tables: Tables, mass: Floats, log_volume: Floats, first: Rows, s
     return cost
 
 
-def _neighbors(means: Floats) -> tuple[Rows, Rows]:
+def _find_neighbors(means: Floats) -> tuple[Rows, Rows]:
     """Return unique pairs of rows that are nearest neighbors, lower row first, in ascending order.
 
     Rows at the same position are paired as a chain, and only the first row of a chain has neighbors elsewhere.
@@ -226,7 +226,7 @@ def build_levels(
     trainer = LevelTrainer(photo_model, folder.with_name(f"{folder.name}.training"), plan) if photo_model else None
     with new_folder(folder) as temporary_folder:
         with trainer.lock() if trainer else nullcontext():
-            levels = _levels(gaussians, plan, trainer)
+            levels = _decimate_repeatedly(gaussians, plan, trainer)
         digest = write_lod(temporary_folder, [level.model.to_splat_file() for level in levels])
         write_sky_file(gaussians.sky, temporary_folder / LOD_META, digest)
     if gaussians.sky:
@@ -281,7 +281,8 @@ def _photo_error(run: Path) -> DataError | None:
     return None
 
 
-def _levels(gaussians: Model, plan: LodPlan, trainer: LevelTrainer | None) -> list[DetailLevel]:
+def _decimate_repeatedly(gaussians: Model, plan: LodPlan, trainer: LevelTrainer | None) -> list[DetailLevel]:
+    """Return all levels, the finest first.  If there is a trainer, it trains and measures them."""
     levels = [trainer.measure(gaussians) if trainer else DetailLevel(gaussians)]
     for number in range(1, plan.levels):
         model = decimate(levels[-1].model, plan.keep)
@@ -302,7 +303,7 @@ def _level_record(folder: Path, number: int, level: DetailLevel) -> dict[str, An
 HEADINGS = ("level", "Gaussians", "MB", "PSNR, dB", "before training")
 
 
-def table(result: dict[str, Any]) -> str:
+def format_table(result: dict[str, Any]) -> str:
     """Format the result of `build_levels` as text."""
     columns = len(HEADINGS) if result["split"] else 3
     return text_table([HEADINGS[:columns], *(_cells(level)[:columns] for level in result["levels"])])

@@ -40,11 +40,11 @@ from clsplat.workflows.surface import extract, hull, reduce, remove_small_parts,
 LOG = logging.getLogger("clsplat")
 VOXEL = 1.2  # in pixels at the median depth
 TRUNCATION = 5.0  # voxels
-OPAQUE, EMPTY = 0.9, 0.1  # alpha of pixels from which the depth is used, and up to which nothing is seen
+OPAQUE, EMPTY = 0.9, 0.1  # the smallest alpha of pixels whose depth is used, and the largest alpha of empty pixels
 NOTHING = 1e10  # depth of empty pixels, scene units
-WINDOW, SIGMA, SIMILAR = 9, 2.5, 2.0  # of denoising: sides and standard deviation, px; depths that mix, voxels
+WINDOW, SIGMA, SIMILAR = 9, 2.5, 2.0  # bilateral filter: side and deviation, px; deviation of the depths, voxels
 PROBES = 16  # views whose depths determine the voxel
-CELL, MAX_CELLS = 2.0, 1 << 23  # of a hull: side in voxels, and the largest number
+CELL, MAX_CELLS = 2.0, 1 << 23  # of a hull: side of a cell in voxels, and maximum number of cells
 HULL_BYTES = 32  # per cell, on the device and the host
 
 
@@ -54,7 +54,7 @@ class MeshOptions:
 
     voxel: float | None = None  # scene units; None: from the size of pixels
     keep: float = 1.0  # fraction of the faces
-    collision: bool = False  # whether to write the closed hull of what no view sees as free
+    collision: bool = False  # whether to write the closed hull of the space that views do not see as free
 
     def __post_init__(self) -> None:
         if self.voxel is not None and not 0 < self.voxel < math.inf:
@@ -136,7 +136,7 @@ def write_mesh(
     photo_model = ModelFile(model, scene, device, downscale)
     if is_moving(photo_model.gaussians):
         command = f"`clsplat convert {shell_quote(model)} OUT.ply --time T`"
-        raise DataError(f"{model}: moves; write one of its times first: {command}")
+        raise DataError(f"{model}: the model moves; first write the model of one time: {command}")
     views = photo_model.scene.split("train") or photo_model.scene.views
     source = DepthSource(Canvas(photo_model.painter), views)
     pixel = source.pixel_size()

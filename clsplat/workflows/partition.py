@@ -45,8 +45,8 @@ class PartitionCell:
         return Box(low=low, high=high)
 
 
-def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[PartitionCell]:
-    """Return `count` cells, each with about the same sum of the weights, [N], of Gaussians at `means`, [N, 3].
+def split_space(means: NDArray[np.floating], weights: Floats, count: int) -> list[PartitionCell]:
+    """Split space into `count` cells whose Gaussians, at `means`, [N, 3], have about the same sum of weights, [N].
 
     Cells are split across their longest side.  Raises DataError if the model cannot be split into `count` cells.
     """
@@ -56,13 +56,13 @@ def cells(means: NDArray[np.floating], weights: Floats, count: int) -> list[Part
     return _split_box(means.astype(np.float64), weights, Box(), count)
 
 
-def assign_cells(means: NDArray[np.floating], partition: list[PartitionCell]) -> NDArray[np.int64]:
+def assign_cells(means: NDArray[np.floating], cells: list[PartitionCell]) -> NDArray[np.int64]:
     """Return the index of the cell that contains each mean, [N].  means: [N, 3].
 
     Raises DataError for means that are not finite.
     """
     cell_index = np.full(len(means), -1)
-    for number, cell in enumerate(partition):
+    for number, cell in enumerate(cells):
         cell_index[cell.box.contains(means)] = number
     if (cell_index < 0).any():
         count = f"{int((cell_index < 0).sum()):,} of {pluralize(len(cell_index), 'Gaussian')}"
@@ -112,7 +112,7 @@ def _round(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-# The views of a block: cameras inside its cell, and views of which its Gaussians cover enough pixels.
+# The views of a block: views whose cameras are in its cell, and views in which its Gaussians cover enough pixels.
 
 Reason = Literal["inside", "coverage", "best"]
 
@@ -223,7 +223,7 @@ class Partition:
 
     blocks: list[Block]
     model: Model  # the coarse model
-    coarse: str  # SHA-256 of its file
+    coarse_digest: str  # SHA-256 of its file
     extent: float  # scene units
     memory: int  # device memory of the coarse model with all views, bytes
     views: int
@@ -231,7 +231,7 @@ class Partition:
     def data(self) -> dict[str, Any]:
         """Return the manifest as JSON data."""
         scene = {"gaussians": len(self.model), "views": self.views, "extent": self.extent, "memory": self.memory}
-        return {"coarse": self.coarse, **scene, "blocks": [block.data() for block in self.blocks]}
+        return {"coarse": self.coarse_digest, **scene, "blocks": [block.data() for block in self.blocks]}
 
     def write(self, folder: Path) -> None:
         """Write the manifest and, next to it, the initial Gaussians of each block."""
@@ -249,16 +249,16 @@ class Partitioner:
         self.extent = scene.extent
         self._rasterizer, self._uploaded = Rasterizer(device), model.upload(device)
 
-    def partition(self, count: int, coarse: str, min_coverage: float = MIN_COVERAGE) -> Partition:
-        """Split the model into `count` blocks.  coarse: SHA-256 of its file; min_coverage: as in `Membership`.
+    def partition(self, count: int, coarse_digest: str, min_coverage: float = MIN_COVERAGE) -> Partition:
+        """Split the model into `count` blocks.  coarse_digest: SHA-256 of its file; min_coverage: as in `Membership`.
 
         Each view is rendered twice.  Raises DataError if the model cannot be split into that many blocks.
         """
         means, gaussian_count = self.model.means, len(self.model)
         pairs = count_pairs(self._render(self.views), gaussian_count, int(self.device.tuning["TILE"]))
-        partition_cells = cells(means, pairs, count)
-        cell_index = assign_cells(means, partition_cells)
-        membership, start_masks = self._members(cell_index, partition_cells, min_coverage)
+        cells = split_space(means, pairs, count)
+        cell_index = assign_cells(means, cells)
+        membership, start_masks = self._assign_views(cell_index, cells, min_coverage)
         blocks = [
             Block(
                 number,
@@ -267,28 +267,28 @@ class Partitioner:
                 float(pairs[cell_index == number].sum() / (pairs.sum() or 1)),
                 start := start_masks[number] | (cell_index == number),
                 self._view_entries(membership, number),
-                self._memory(int(start.sum()), np.flatnonzero(membership.assignment[:, number]).tolist()),
+                self._estimate_memory(int(start.sum()), np.flatnonzero(membership.assignment[:, number]).tolist()),
                 self.model.origin,
             )
-            for number, cell in enumerate(partition_cells)
+            for number, cell in enumerate(cells)
         ]
-        memory = self._memory(gaussian_count, range(len(self.views)))
-        return Partition(blocks, self.model, coarse, self.extent, memory, len(self.views))
+        memory = self._estimate_memory(gaussian_count, range(len(self.views)))
+        return Partition(blocks, self.model, coarse_digest, self.extent, memory, len(self.views))
 
-    def _members(
-        self, cell_index: NDArray[np.int64], partition: list[PartitionCell], min_coverage: float
+    def _assign_views(
+        self, cell_index: NDArray[np.int64], cells: list[PartitionCell], min_coverage: float
     ) -> tuple[Membership, Mask]:
         """Return the views of each block, and a mask, [B, N], of Gaussians visible in its views or in no view."""
         positions = np.stack([view.position for view in self.views])
-        is_inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in partition], axis=1)
-        coverage, visible_in_block = np.zeros(is_inside.shape), np.zeros((len(partition), len(cell_index)), bool)
+        is_inside = np.stack([cell.extended(NEAR_CELL).contains(positions) for cell in cells], axis=1)
+        coverage, visible_in_block = np.zeros(is_inside.shape), np.zeros((len(cells), len(cell_index)), bool)
         for view, render in enumerate(self._render(self.views)):
-            coverage[view], is_visible = view_coverage(render, cell_index, len(partition))
+            coverage[view], is_visible = view_coverage(render, cell_index, len(cells))
             visible_in_block[Membership(coverage[[view]], is_inside[[view]], min_coverage).view_blocks[0]] |= is_visible
         membership = Membership(coverage, is_inside, min_coverage)
         for view, block in np.argwhere(membership.assignment & ~membership.view_blocks):
             (render,) = self._render([self.views[view]])
-            visible_in_block[block] |= view_coverage(render, cell_index, len(partition))[1]
+            visible_in_block[block] |= view_coverage(render, cell_index, len(cells))[1]
         # Gaussians hidden from all views may become visible in any
         return membership, visible_in_block | ~visible_in_block.any(axis=0)
 
@@ -307,7 +307,7 @@ class Partitioner:
             for view in np.flatnonzero(membership.assignment[:, block]).tolist()
         ]
 
-    def _memory(self, gaussians: int, views: Sequence[int]) -> int:
+    def _estimate_memory(self, gaussians: int, views: Sequence[int]) -> int:
         """Return the device memory for training, in bytes.  gaussians: initial number; views: indices of views."""
         cameras = [self.views[view].camera for view in views]
         sizes = [4 * camera.width * camera.height for camera in cameras]

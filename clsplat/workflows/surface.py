@@ -21,9 +21,9 @@ from clsplat.render.fusion import SIDE, DistanceField
 
 LOG = logging.getLogger("clsplat")
 MIN_VALUE = 2e-3  # of a distance, so that no vertex is at a grid point, where its edge would be unknown
-MIN_FRACTION = 1e-4  # of an edge, from its ends: smaller ones are rounding
-MIN_PART = 0.01  # of the faces of the largest part: smaller ones are removed
-TAUBIN, ROUNDS = (0.5, -0.53), 20  # Taubin 1995: steps of smoothing that do not shrink, and their number
+MIN_FRACTION = 1e-4  # of an edge, from its ends; smaller distances are rounding errors
+MIN_PART = 0.01  # of the faces of the largest part; smaller parts are removed
+TAUBIN, ROUNDS = (0.5, -0.53), 20  # Taubin 1995: factors of two steps that together do not shrink; number of rounds
 MORE_FACES = 1.5  # factor on the faces after a reduction that opened a closed surface
 MIN_REDUCED = 1000  # faces: smaller meshes are not reduced
 
@@ -108,9 +108,9 @@ def _interpolate(colors: NDArray[np.uint8], vertices: Floats) -> NDArray[np.uint
     colors: [n, n, n, 4] red, green, blue, and 1 where they are known.
     """
     low, high = np.floor(vertices + MIN_FRACTION).astype(int), np.ceil(vertices - MIN_FRACTION).astype(int)
-    share = np.clip(vertices - low, 0, 1).max(axis=1, keepdims=True)
+    fraction = np.clip(vertices - low, 0, 1).max(axis=1, keepdims=True)
     ends = [colors[tuple(corner.T)].astype(np.float64) for corner in (low, high)]
-    weights = (1 - share) * ends[0][:, 3:], share * ends[1][:, 3:]
+    weights = (1 - fraction) * ends[0][:, 3:], fraction * ends[1][:, 3:]
     total = np.maximum(weights[0] + weights[1], 1e-12)
     average = np.rint((weights[0] * ends[0][:, :3] + weights[1] * ends[1][:, :3]) / total)
     return np.asarray(average, np.uint8)
@@ -140,7 +140,7 @@ def _adjacency(mesh: Mesh) -> Any:
     first, second = mesh.faces[:, [0, 1, 2]].ravel(), mesh.faces[:, [1, 2, 0]].ravel()
     ends = np.concatenate([first, second]), np.concatenate([second, first])
     matrix = sparse.csr_matrix((np.ones(len(ends[0])), ends), shape=(len(mesh.vertices),) * 2)
-    matrix.data[:] = 1  # duplicates were added
+    matrix.data[:] = 1  # csr_matrix adds the values of edges that occur twice
     return matrix
 
 

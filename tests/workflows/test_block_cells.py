@@ -9,14 +9,14 @@ from clsplat.core.errors import DataError
 from clsplat.density.control import Box
 from clsplat.formats import ply
 from clsplat.formats.ply import join_plys, read_ply, write_ply
-from clsplat.workflows.partition import Membership, assign_cells, cells, quantile
+from clsplat.workflows.partition import Membership, assign_cells, quantile, split_space
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
 def test_gaussians_are_partitioned_into_equal_cells(rng, count):
     means = (rng.standard_normal((4000, 3)) * [20, 5, 1]).astype(np.float32)
     weights = rng.random(4000) * np.exp(means[:, 0] / 20)
-    result = cells(means, weights, count)
+    result = split_space(means, weights, count)
     held = np.stack([cell.box.contains(means) for cell in result])
     assert (held.sum(axis=0) == 1).all()
     np.testing.assert_array_equal(assign_cells(means, result), held.argmax(axis=0))
@@ -27,12 +27,12 @@ def test_gaussians_are_partitioned_into_equal_cells(rng, count):
 
 def test_only_long_sides_are_cut(rng):
     means = rng.standard_normal((2000, 3)) * [20, 5, 0.1]
-    for cell in cells(means, np.ones(2000), 4):
+    for cell in split_space(means, np.ones(2000), 4):
         assert (cell.box.low[2], cell.box.high[2]) == (None, None)
 
 
 def test_cell_margin_is_half_the_share_per_bounded_side():
-    left, right = cells(np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [12, 0, 0]]), np.ones(4), 2)
+    left, right = split_space(np.array([[0.0, 0, 0], [1, 0, 0], [10, 0, 0], [12, 0, 0]]), np.ones(4), 2)
     assert 0 < left.box.high[0] == right.box.low[0] <= 10
     assert left.extended(0.2).high[0] == pytest.approx(left.box.high[0] + 0.1 * left.size[0])
     assert right.extended(0.2).low[0] == pytest.approx(right.box.low[0] - 0.1 * right.size[0])
@@ -41,18 +41,18 @@ def test_cell_margin_is_half_the_share_per_bounded_side():
 
 def test_empty_model_is_not_cut():
     with pytest.raises(DataError, match="has no Gaussians"):
-        cells(np.zeros((0, 3)), np.zeros(0), 2)
+        split_space(np.zeros((0, 3)), np.zeros(0), 2)
 
 
 def test_coincident_positions_are_not_cut():
     with pytest.raises(DataError, match="5 Gaussians cannot be split into 2 blocks; use fewer --blocks"):
-        cells(np.ones((5, 3)), np.ones(5), 2)
+        split_space(np.ones((5, 3)), np.ones(5), 2)
 
 
 def test_nonfinite_position_is_reported():
     means = np.array([[0.0, 0, 0], [np.nan, 0, 0]])
     with pytest.raises(DataError, match="1 of 2 Gaussians of the coarse model have positions that are not finite"):
-        assign_cells(means, cells(means[:1], np.ones(1), 1))
+        assign_cells(means, split_space(means[:1], np.ones(1), 1))
 
 
 def test_quantile_follows_the_weights():
@@ -102,5 +102,5 @@ def test_incompatible_models_are_not_joined(rng, tmp_path):
 
 
 def test_box_of_all_space_is_the_cell_of_one_block():
-    (cell,) = cells(np.zeros((3, 3)), np.zeros(3), 1)
+    (cell,) = split_space(np.zeros((3, 3)), np.zeros(3), 1)
     assert cell.box == cell.extended(0.2) == Box()

@@ -24,7 +24,7 @@ from clsplat.runs import model_file, runner
 from clsplat.runs.model_file import ModelSource
 from clsplat.training.run import Run
 from clsplat.workflows import compress
-from clsplat.workflows.compress import SOG_STAGES, CompressionTarget, Entry, Ladder, ordered_keeps, page, table
+from clsplat.workflows.compress import SOG_STAGES, CompressionTarget, Entry, Ladder, format_table, ordered_keeps, page
 from clsplat.workflows.finetune import Tuning
 from tests.support.html_page import Page
 from tests.support.runs import NO_PROCESS
@@ -277,7 +277,7 @@ def test_command_prints_a_table(searched, few_steps):
     arguments = ["--target", "-40dB", "--out", str(searched), "--keep", "1,0.5", "--steps", str(STEPS)]
     result = CliRunner().invoke(app, ["compress", str(few_steps), *arguments])
     assert result.exit_code == 0, result.output
-    assert table(json.loads((searched / "compress.json").read_text())) in result.output
+    assert format_table(json.loads((searched / "compress.json").read_text())) in result.output
     assert "compressed.sog: " in result.output
 
 
@@ -285,7 +285,7 @@ def test_zero_loss_has_no_sign(monkeypatch):
     same = {"psnr": 30.0, "bytes": 10}
     actual = {"chosen": {**same, "psnr": 29.999}, "source": same, "file": "a.sog", "page": "a.html"}
     monkeypatch.setattr("clsplat.api.commands.compress_model", lambda *_, **__: actual)
-    monkeypatch.setattr("clsplat.workflows.compress.table", lambda _: "")
+    monkeypatch.setattr("clsplat.workflows.compress.format_table", lambda _: "")
     output = CliRunner().invoke(app, ["compress", "a.ply"]).output
     assert "0.00 dB" in output
     assert "-0.00" not in output

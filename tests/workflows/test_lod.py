@@ -17,7 +17,7 @@ from clsplat.formats.table import model_bytes, read
 from clsplat.gaussians.sky import Sky
 from clsplat.runs import runner
 from clsplat.workflows import lod
-from clsplat.workflows.lod import LodPlan, decimate, table
+from clsplat.workflows.lod import LodPlan, decimate, format_table
 from tests.support.runs import NO_PROCESS
 
 pytestmark = pytest.mark.slow
@@ -100,7 +100,7 @@ def test_model_file_is_merged_without_a_device(few_steps, tmp_path, monkeypatch)
     assert [level["gaussians"] for level in result["levels"]] == [whole, int(0.3 * whole + 0.5)]
     assert result["split"] is None
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["model.ply", "site"]
-    assert table(result).splitlines()[0].split() == ["level", "Gaussians", "MB"]
+    assert format_table(result).splitlines()[0].split() == ["level", "Gaussians", "MB"]
 
 
 @pytest.fixture
