@@ -16,7 +16,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.files import PIPELINE, remove_partial_files, write_text
 from clsplat.core.progress import ItemCounter
 from clsplat.core.reading import read_json, sha256
-from clsplat.scene.images import image_size, is_image, write_image
+from clsplat.scene.images import is_image, read_image_size, write_image
 from clsplat.scene.quality import SIDE, sharpness
 from clsplat.scene.times_file import write_times
 
@@ -107,7 +107,7 @@ def _are_frame_indices(indices: Any) -> bool:
 def _is_readable(path: Path) -> bool:
     """Return whether the file exists and is a readable image."""
     try:
-        return bool(image_size(path))
+        return bool(read_image_size(path))
     except DataError:
         return False
 

@@ -15,7 +15,7 @@ from clsplat.core.schedule import schedule_values
 from clsplat.opencl.device import Device
 from clsplat.pipeline.loading import Pipeline, apply_adaptation
 from clsplat.prepare.cache import PlannedStep
-from clsplat.scene.images import image_size
+from clsplat.scene.images import read_image_size
 from clsplat.scene.quality import Measures
 from clsplat.stages.densify import Densify
 from clsplat.stages.init import Init
@@ -100,7 +100,7 @@ def _first_photo_size(folder: Path, names: Sequence[str]) -> tuple[int, int] | N
     """Return the size, px, of the first readable photo; None if the first three are unreadable."""
     for name in names[:3]:
         with suppress(DataError):
-            return image_size(folder / name)
+            return read_image_size(folder / name)
     return None
 
 

@@ -47,7 +47,7 @@ def with_image_names(scene: Scene) -> Scene:
     return scene.renamed(names)
 
 
-def image_files(views: Sequence[View], folder: Path) -> dict[Path, Path]:
+def plan_copies(views: Sequence[View], folder: Path) -> dict[Path, Path]:
     """Return a dictionary from the path of each photograph's copy in `folder` to the photograph.
 
     Raises DataError if a view has no photograph, or only a part of a wide one.
@@ -219,8 +219,8 @@ OUTPUTS = {  # the files of each format
 }
 UNDISTORTED = ("inria",)  # formats without lens distortion
 COPIES = ("none", "copy")  # of the photographs
-SPLIT = "nerfstudio"  # the format that stores the split and times
-TRACKS = "colmap"  # the format that stores which points each photograph shows
+SPLIT_FORMAT = "nerfstudio"  # the format that stores the split and times
+TRACKS_FORMAT = "colmap"  # the format that stores which points each photograph shows
 
 
 def check_cameras(scene: Scene, format_: str) -> Scene:
@@ -256,19 +256,19 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
             f"{scene.path}: {format_} has no lens distortion, and these photos are distorted; "
             "run `clsplat data undistort` first, or write only the cameras"
         )
-    copies = image_files(renamed_scene.views, out / IMAGES) if images == "copy" else {}
+    copies = plan_copies(renamed_scene.views, out / IMAGES) if images == "copy" else {}
     sidecars = [out / IMAGES / EXPOSURES_FILE] if copies else []
     for path in () if overwrite else (*(out / file for file in OUTPUTS[format_]), *copies, *sidecars):
         if path_exists(path):
             raise ConfigError(f"{path}: exists; choose another folder, or remove the file")
     files = WRITERS[format_](out, renamed_scene)
-    if format_ != SPLIT and scene.test:
-        test_views = f"{len(scene.test)} of {len(scene.views)}"
-        LOG.warning("%s: %s does not store which %s views are test views; %s does", out, format_, test_views, SPLIT)
-    if format_ != SPLIT and any(view.time is not None for view in scene.views):
-        LOG.warning("%s: %s does not store the times of the views; %s does", out, format_, SPLIT)
-    if format_ != TRACKS and copies and scene.tracks is not None:
-        LOG.warning("%s: %s does not store which points the photos show; %s does", out, format_, TRACKS)
+    if format_ != SPLIT_FORMAT and scene.test:
+        count = f"{len(scene.test)} of {len(scene.views)}"
+        LOG.warning("%s: %s does not store which %s views are test views; %s does", out, format_, count, SPLIT_FORMAT)
+    if format_ != SPLIT_FORMAT and any(view.time is not None for view in scene.views):
+        LOG.warning("%s: %s does not store the times of the views; %s does", out, format_, SPLIT_FORMAT)
+    if format_ != TRACKS_FORMAT and copies and scene.tracks is not None:
+        LOG.warning("%s: %s does not store which points the photos show; %s does", out, format_, TRACKS_FORMAT)
     for path, source in counted(copies.items(), "photos copied", len(copies)):
         with open_file(source, "an image") as src, open_atomic(path) as dst:
             shutil.copyfileobj(src, dst)

@@ -86,7 +86,7 @@ MAX_ID = 2**63 - 1
 
 def read_cameras_text(path: Path) -> Iterator[tuple[int, CameraRecord]]:
     """Yield the ID and the record of each camera.  Raises DataError, like all functions here, for a damaged file."""
-    for source, line in _lines(path):
+    for source, line in _read_lines(path):
         if line:
             layout = "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"
             fields = line.split()
@@ -101,7 +101,7 @@ def read_images_text(path: Path) -> Iterator[ImageRecord]:
     layout = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
     types = (int, *[float] * 7, int, str)
     image: ImageRecord | None = None  # its points may follow on the next line
-    for source, line in _lines(path):
+    for source, line in _read_lines(path):
         if image and _is_points2d(line):
             points, pixels = _parse_points2d(line)
             yield image._replace(points=points, pixels=pixels)
@@ -141,13 +141,13 @@ def read_points_text(path: Path) -> PointTable:
     """Return all points with their reprojection errors."""
     types = (_parse_id, float, float, float, _parse_byte, _parse_byte, _parse_byte, float)
     layout = "POINT3D_ID X Y Z R G B ERROR TRACK[]"
-    rows = [_convert(source, line.split(maxsplit=8)[:8], types, layout) for source, line in _lines(path) if line]
+    rows = [_convert(source, line.split(maxsplit=8)[:8], types, layout) for source, line in _read_lines(path) if line]
     table = np.array([row[1:] for row in rows], np.float64).reshape(-1, 7)
     ids = np.array([row[0] for row in rows], np.int64).reshape(-1)
     return PointTable(path, table[:, :3], table[:, 3:6], table[:, 6], ids)
 
 
-def _lines(path: Path) -> Iterator[tuple[str, str]]:
+def _read_lines(path: Path) -> Iterator[tuple[str, str]]:
     """Yield the position, for messages, and the text of each line that is not a comment."""
     text = decode(str(path), read_file(path)).lstrip("\ufeff")
     require_content(path, text.encode() or b"#")  # a file without points may be empty
@@ -339,7 +339,7 @@ class ColmapReader(Reader):
         views = sorted((views[i] for i in files.existing_indices(path, self.missing)), key=lambda view: view.name)
         views, table = add_times(views, files.folder), read_point_table(model)
         full_size = [view for view in views if view.image_path not in files.downscaled_files]
-        points, tracks = (table.cloud(), make_tracks(images, table, full_size)) if table else (None, None)
+        points, tracks = (table.to_point_cloud(), make_tracks(images, table, full_size)) if table else (None, None)
         views = [fit_to_photograph(view) if view.image_path in files.downscaled_files else view for view in views]
         scene = make_scene(path, views, every_nth([view.name for view in views], holdout), points)
         tracks = tracks and tracks.shifted(scene.origin).split_by_face(scene.views)
@@ -363,18 +363,18 @@ class ColmapReader(Reader):
 
     def _locate(self, path: Path, images: list[ImageRecord]) -> tuple[list[ImageRecord], FileLookup, list[Path | None]]:
         """Return the images, renamed to match their files, and the files and masks of the images."""
-        folder = image_folder(path, self.root)
+        folder = find_image_folder(path, self.root)
         root = self.root if self.root and folder.is_relative_to(self.root) else folder.parent
         files = FileLookup(root, folder, [image.name for image in images])
         images = [image._replace(name=name) for image, name in zip(images, files.names, strict=True)]
         return images, files, find_masks(folder.with_name("masks"), files.names)
 
 
-def camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
+def read_camera_views(path: Path) -> tuple[list[View], PointCloud | None]:
     """Return a view without a photograph for each image of the largest model, and the points."""
     model, images = _read_largest_model(path)
     cameras, table = read_cameras(model), read_point_table(model)
-    return [make_view(image, cameras) for image in images], table.cloud() if table else None
+    return [make_view(image, cameras) for image in images], table.to_point_cloud() if table else None
 
 
 def make_tracks(images: Sequence[ImageRecord], table: PointTable, views: Sequence[View] = ()) -> Tracks | None:
@@ -418,7 +418,7 @@ def _read_largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     return best
 
 
-def image_folder(path: Path, root: Path | None = None) -> Path:
+def find_image_folder(path: Path, root: Path | None = None) -> Path:
     """Return `images` next to `sparse` if `path` is `sparse` or one of its models, otherwise `images` in `path`.
 
     If that folder does not exist, return the nearest `images` in a parent folder, up to `root`.

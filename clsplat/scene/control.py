@@ -64,7 +64,7 @@ class MarkedPoint:
         views = [find_view(scene, mark.photo) for mark in self.marks]
         pixels = np.array([mark.pixel for mark in self.marks])
         if len(views) == 1:
-            return self._nearest_point(scene, views[0], pixels)
+            return self._find_nearest_point(scene, views[0], pixels)
         rays = [_ray(view, pixel) for view, pixel in zip(views, pixels, strict=True)]
         directions = np.stack([direction for _, direction in rays])
         if not (directions @ directions.T).min() <= math.cos(MIN_ANGLE):
@@ -86,7 +86,7 @@ class MarkedPoint:
         rows = zip(self.marks, distances.tolist(), is_outlier.tolist(), strict=True)
         return position, [LocatedMark(*row) for row in rows]
 
-    def _nearest_point(self, scene: Scene, view: View, pixels: Floats) -> tuple[Floats, list[LocatedMark]]:
+    def _find_nearest_point(self, scene: Scene, view: View, pixels: Floats) -> tuple[Floats, list[LocatedMark]]:
         rows = scene.tracks.rows.get(view.name) if scene.tracks else None
         if scene.tracks is None or rows is None or not len(rows):
             raise DataError(
@@ -252,9 +252,9 @@ def _parse_end(text: str, points: Mapping[str, MarkedPoint]) -> Floats | MarkedP
     return MarkedPoint(text, tuple(marks))
 
 
-# GPS positions, in the coordinates of maps (WGS 84 / UTM).
+# GPS positions in map coordinates (WGS 84 / UTM).
 
-AXIS, FLATTENING, CENTRAL_SCALE = 6378137.0, 1 / 298.257223563, 0.9996  # m; of WGS 84 and UTM
+SEMI_MAJOR_AXIS, FLATTENING, CENTRAL_SCALE = 6378137.0, 1 / 298.257223563, 0.9996  # m; of WGS 84 and UTM
 FALSE_EASTING, FALSE_NORTHING = 500_000.0, 10_000_000.0  # m
 
 
@@ -287,7 +287,7 @@ def to_utm(positions: Floats) -> tuple[Floats, int]:
     is_south = float(np.median(positions[:, 0])) < 0
     latitude, longitude = np.radians(positions[:, 0]), np.radians(positions[:, 1] - (6 * zone - 183))
     n = FLATTENING / (2 - FLATTENING)
-    radius = AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
+    radius = SEMI_MAJOR_AXIS / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
     eccentricity = 2 * math.sqrt(n) / (1 + n)
     sine = np.clip(np.sin(latitude), -1 + 1e-15, 1 - 1e-15)
     t = np.sinh(np.arctanh(sine) - eccentricity * np.arctanh(eccentricity * sine))

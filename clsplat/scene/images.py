@@ -172,7 +172,7 @@ def write_image(path: Path, pixels: NDArray[np.uint8]) -> None:
         file.write(encoded.tobytes())
 
 
-def image_size(path: Path) -> tuple[int, int]:
+def read_image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of an image file in pixels.  Raises DataError when it cannot be read."""
     height, width = read_image(path).shape[:2]
     return width, height
@@ -184,10 +184,12 @@ def read_header(path: Path) -> Header:
         head = file.read(HEAD_SIZE)
         file.seek(max(0, file.seek(0, 2) - TAIL_SIZE))
         tail = file.read(TAIL_SIZE)
-    return parse_header(head, tail, lambda: read_file(path, "an image", limit=MAX_BYTES)) or Header(*image_size(path))
+    return parse_header(head, tail, lambda: read_file(path, "an image", limit=MAX_BYTES)) or Header(
+        *read_image_size(path)
+    )
 
 
-def stored_size(path: Path) -> tuple[int, int]:
+def read_stored_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of an image file in pixels, as stored.  Raises DataError when it cannot be read."""
     header = read_header(path)
     return header.width, header.height
@@ -383,7 +385,7 @@ def _read_ifd(block: bytes, order: str, start: int) -> dict[int, Value]:
         tag, value_type, count, value = struct.unpack_from(order + "HHII", block, entry)
         if value_type == RATIONAL:
             numbers = struct.unpack_from(order + "II" * (3 if count == 3 else 1), block, value)
-            if numbers[1]:  # of the others, 0/0 means unknown
+            if numbers[1]:  # 0/0 means that the value is unknown
                 pairs = zip(numbers[::2], numbers[1::2], strict=True)
                 values[tag] = sum(n / (d or 1) / 60**i for i, (n, d) in enumerate(pairs))
         elif value_type in (BYTE, SHORT, LONG):

@@ -34,7 +34,7 @@ class LlffReader(Reader):
 
     def read(self, path: Path, holdout: int) -> Scene:
         file = path / POSES_FILE
-        rows, images = read_poses(file), image_files(path)
+        rows, images = read_poses(file), find_image_files(path)
         if len(rows) != len(images):
             raise DataError(
                 f"{file}: has {len(rows)} poses for {len(images)} images in {images[0].parent if images else path}; "
@@ -48,7 +48,7 @@ class LlffReader(Reader):
 
     def list_parts(self, parts: Parts) -> None:
         super().list_parts(parts)
-        parts.disk_files = image_files(parts.path)
+        parts.disk_files = find_image_files(parts.path)
 
 
 def read_poses(path: Path) -> NDArray[np.float64]:
@@ -68,7 +68,7 @@ def read_poses(path: Path) -> NDArray[np.float64]:
     return np.asarray(rows, np.float64)
 
 
-def image_files(path: Path) -> list[Path]:
+def find_image_files(path: Path) -> list[Path]:
     """Return the image files of a dataset, sorted by name.
 
     They are in the first folder that contains images: `images`, `input`, `images_N` in ascending order of N, or `path`

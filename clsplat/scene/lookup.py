@@ -20,7 +20,7 @@ from clsplat.core.reading import open_regular
 from clsplat.scene.images import is_image
 
 Missing = Literal["refuse", "skip"]  # what to do about missing photographs
-Parts = tuple[str, ...]  # the parts of a path
+PathParts = tuple[str, ...]  # the parts of a path
 MAX_DEPTH = 6  # levels of folders to search below the folder of the scene
 MAX_COMPARED = 5000  # file names to search for the most similar one
 RESULTS = {STATUS, "record.json", "cfg_args"}  # files that mark folders of runs (ours and 3DGS's) and of `prepare`
@@ -99,8 +99,8 @@ class FileLookup:
     """The image files of a dataset that another machine or program may have written.
 
     The file `folder / name` is used if it exists.  Otherwise, a name and a file below `root` match if each is the only
-    best match of the other; the best match has the longest common end of the path.  Case, the kind of slash, Unicode
-    normalization, URL escapes and the image suffix are ignored, and so are symbolic links that point out of `root`.
+    best match of the other.  Paths match better if more of their last components are equal.  Case, the kind of slash,
+    Unicode normalization, URL escapes, and the image suffix are ignored; symbolic links that point out of `root`, too.
 
     spellings: returns the file names to try first for a name, by default the name itself.  strict: require that
     the entire relative path of the file or of the name matches, as for masks and depth maps.  excluded: files that must
@@ -140,7 +140,7 @@ class FileLookup:
                     return True
         return False
 
-    def _normalized_parts(self, name: str) -> Parts:
+    def _normalized_parts(self, name: str) -> PathParts:
         """Return the normalized parts of a name's path, relative to `root` if possible, or () for an invalid name."""
         path = PureWindowsPath(name)
         parts = path.parts[1:] if path.anchor else path.parts
@@ -153,9 +153,9 @@ class FileLookup:
         return tuple(map(_normalize, parts))
 
     @cached_property
-    def _files(self) -> dict[str, list[tuple[Parts, Path]]]:
+    def _files(self) -> dict[str, list[tuple[PathParts, Path]]]:
         """The image files below `root` with the normalized parts of their paths, by normalized stem."""
-        files, real_root = defaultdict[str, list[tuple[Parts, Path]]](list), os.path.realpath(self.root)
+        files, real_root = defaultdict[str, list[tuple[PathParts, Path]]](list), os.path.realpath(self.root)
         for folder, names in walk_folders(self.root, MAX_DEPTH):
             parts = tuple(map(_normalize, folder.relative_to(self.root).parts))
             for path in (folder / name for name in names if name[0] != "." and is_image(PurePath(name))):
@@ -165,12 +165,12 @@ class FileLookup:
 
     def _match(self, unmatched: Sequence[int], excluded: set[Path]) -> None:
         targets = list(map(self._normalized_parts, self.raw_names)) if unmatched else []
-        targets_by_key = defaultdict[str, set[Parts]](set)
+        targets_by_key = defaultdict[str, set[PathParts]](set)
         for target in targets:
             for key in _keys(target):
                 targets_by_key[key].add(target)
         for i in unmatched:
-            candidates_by_rank = defaultdict[tuple[int, ...], list[tuple[Parts, Path]]](list)
+            candidates_by_rank = defaultdict[tuple[int, ...], list[tuple[PathParts, Path]]](list)
             files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in excluded]
             siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
             for parts, path in siblings or files:
@@ -187,7 +187,7 @@ class FileLookup:
                     self.names[i], self.paths[i], self.matches[i] = path.relative_to(base).as_posix(), path, length
                     self.downscaled_files |= {path} if _divisor(parts[:-length]) > 1 else set()
 
-    def _rank(self, dataset_name: str, target: Parts, parts: Parts, path: Path) -> tuple[int, ...] | None:
+    def _rank(self, dataset_name: str, target: PathParts, parts: PathParts, path: Path) -> tuple[int, ...] | None:
         """Return the rank of a file as a match of a name (larger is better), or None if it does not match."""
         length, name = _common_suffix(target, parts), PureWindowsPath(dataset_name)
         parents = {*parts[:-length]}
@@ -254,12 +254,12 @@ def _stem(name: str) -> str:
     return path.stem if is_image(path) or CONVERTED.fullmatch(path.suffix) else path.name
 
 
-def _keys(parts: Parts) -> set[str]:
+def _keys(parts: PathParts) -> set[str]:
     """Return the possible stems of the file for a name, such as `a.jpg.png`, `a.jpg` and `a` for `a.jpg.png`."""
     return {parts[-1], _stem(parts[-1]), _stem(_stem(parts[-1]))} if parts else set()
 
 
-def _common_suffix(a: Parts, b: Parts) -> int:
+def _common_suffix(a: PathParts, b: PathParts) -> int:
     """Return the number of equal parts at the end of two paths whose file names match."""
     return 1 + len([*takewhile(lambda pair: pair[0] == pair[1], zip(a[-2::-1], b[-2::-1], strict=False))])
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 
 from clsplat.core.errors import DataError, first_few, shell_quote
-from clsplat.scene.colmap import camera_views, find_models, read_images
-from clsplat.scene.images import is_image, stored_size
+from clsplat.scene.colmap import find_models, read_camera_views, read_images
+from clsplat.scene.images import is_image, read_stored_size
 from clsplat.scene.reader import Reader
 from clsplat.scene.scene import PointCloud, Scene, every_nth, make_scene
 from clsplat.scene.times import Clock
@@ -34,12 +34,12 @@ class MulticameraReader(Reader):
 
     def matches(self, path: Path) -> bool:
         """Return whether an entry of `videos` has the name of a camera.  Other scenes may keep source videos there."""
-        names = {entry.name if entry.is_dir() else entry.stem for entry in _entries(path)}
-        return bool(names) and not names.isdisjoint(_camera_names(path))
+        names = {entry.name if entry.is_dir() else entry.stem for entry in _list_entries(path)}
+        return bool(names) and not names.isdisjoint(_find_camera_names(path))
 
     def read(self, path: Path, holdout: int) -> Scene:
-        frames = _frames(path)
-        cameras, points = _camera_views(path, frames)
+        frames = _find_frames(path)
+        cameras, points = _read_camera_views(path, frames)
         test = every_nth(sorted(cameras), holdout)
         views, test_indices = list[View](), set[int]()
         for number, (name, camera) in enumerate(sorted(cameras.items())):
@@ -58,13 +58,13 @@ def _candidate_names(image: str) -> tuple[str, str]:
     return name.stem, name.parent.name
 
 
-def _entries(path: Path) -> list[Path]:
+def _list_entries(path: Path) -> list[Path]:
     """Return the entries of the folder `videos`, sorted by name; empty if the folder does not exist."""
     folder = path / VIDEOS
     return sorted(entry for entry in folder.iterdir() if entry.name[0] != ".") if folder.is_dir() else []
 
 
-def _camera_names(path: Path) -> set[str]:
+def _find_camera_names(path: Path) -> set[str]:
     """Return the possible camera names of a dataset; empty if a file is damaged, which another reader reports."""
     try:
         if (path / TRANSFORMS).is_file():
@@ -77,9 +77,9 @@ def _camera_names(path: Path) -> set[str]:
     return {name for image in images for name in _candidate_names(image)}
 
 
-def _frames(path: Path) -> dict[str, list[Path]]:
+def _find_frames(path: Path) -> dict[str, list[Path]]:
     """Return the sorted frames of each camera.  Raises DataError unless all have the same number, at least 2."""
-    entries = _entries(path)
+    entries = _list_entries(path)
     frames = {
         entry.name: sorted(filter(is_image, entry.iterdir()), key=_natural_order) for entry in entries if entry.is_dir()
     }
@@ -116,16 +116,16 @@ def _natural_order(frame: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", frame.name)]
 
 
-def _camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, View], PointCloud | None]:
+def _read_camera_views(path: Path, frames: dict[str, list[Path]]) -> tuple[dict[str, View], PointCloud | None]:
     """Return a view for each camera with frames, and the points.  Raises DataError for a camera without a pose."""
     if (path / TRANSFORMS).is_file():
         transforms = Transforms(path / TRANSFORMS)
         first_frame = next(iter(frames.values()))[0]
-        size = stored_size(first_frame)
+        size = read_stored_size(first_frame)
         views = [make_view(frame, frame.image_name(), size) for frame in transforms.frames]
-        points = transforms.points(Clock(0.0, 1.0))
+        points = transforms.read_points(Clock(0.0, 1.0))
     else:
-        views, points = camera_views(path)
+        views, points = read_camera_views(path)
     cameras: dict[str, View] = {}
     for view in views:
         name = next((name for name in _candidate_names(view.name) if name in frames), None)

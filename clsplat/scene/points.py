@@ -41,7 +41,7 @@ class PointTable(NamedTuple):
         is_finite = (np.abs(self.positions) < MAX_VALUE).all(axis=1)
         return np.asarray(is_finite & (np.abs(self.times) < MAX_VALUE) if len(self.times) else is_finite)
 
-    def cloud(self, clock: Clock | None = None) -> PointCloud:
+    def to_point_cloud(self, clock: Clock | None = None) -> PointCloud:
         """Return the finite points, and log how many points are dropped.
 
         clock: the clock of the frames; without a clock, the points have no times.  Raises DataError if the times of the
@@ -62,7 +62,7 @@ def read_points_ply(path: Path, clock: Clock | None = None) -> PointCloud:
     The vertices need the properties x y z and uchar red green blue; others are ignored.  Raises DataError if the file
     is damaged, is big-endian or lacks these properties, or if the times are in a different unit from the frames' times.
     """
-    return read_ply_table(path).cloud(clock)
+    return read_ply_table(path).to_point_cloud(clock)
 
 
 def read_ply_table(path: Path) -> PointTable:

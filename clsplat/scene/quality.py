@@ -114,7 +114,7 @@ def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool
 
 # Blank photographs, and masks that exclude everything.
 
-DARK, PLAIN = 8, 2  # gray levels of 255: upper bounds of the levels of a black image, and of the range of a plain one
+DARK, PLAIN = 8, 2  # of 255: upper bounds of the levels of a black image, and of their range in a plain image
 
 
 def is_blank(pixels: NDArray[Any]) -> bool:

@@ -67,7 +67,7 @@ def rotation_between(start: Floats, end: Floats) -> Floats:
 
 # Least squares (Umeyama 1991), and outliers.
 
-NOT_DETERMINED = 1e-3  # spread of points across their main direction, relative to the spread along it
+MIN_SPREAD = 1e-3  # of points across their main direction, relative to the spread along it
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,17 +127,17 @@ class Correspondences:
         spreads = np.linalg.svd(points, compute_uv=False) / np.sqrt(len(points))
         spread = float(spreads[1 if self.up is None else 0])
         error = float(np.sqrt((self.distances(transform)[is_inlier] ** 2).mean()))
-        if not transform.scale > 0 or spread * transform.scale <= max(error, NOT_DETERMINED * spreads[0]):
+        if not transform.scale > 0 or spread * transform.scale <= max(error, MIN_SPREAD * spreads[0]):
             shape = "nearly on a line" if self.up is None else "above each other"
             remedy = "add --level, or points away from that line" if self.up is None else "add points at other places"
             raise DataError(
-                f"the points are {shape}, compared with their errors of {error:.3g}, so that they do not determine "
-                f"the rotation; {remedy}"
+                f"the points are {shape}, up to their errors of {error:.3g}, so they do not determine the rotation; "
+                f"{remedy}"
             )
 
 
-ROUNDING = 1e-6  # of the spread of the targets: smaller distances are exact
-CUT = 3.0  # times the median distance: farther points are outliers (4.6 standard deviations of each coordinate)
+ROUNDING = 1e-6  # of the spread of the targets: smaller distances are rounding errors
+OUTLIER_DISTANCE = 3.0  # times the median distance; it is 4.6 standard deviations of each coordinate
 MAX_SAMPLES = 1000
 MAX_ROUNDS = 20
 Fit = TypeVar("Fit")
@@ -161,7 +161,7 @@ def fit_without_outliers(
         return fit(all_rows), np.zeros(count, bool)
     middle = (count + minimum + 1) // 2 - 1  # highest breakdown point
     best = min(map(fit, _samples(count, minimum)), key=lambda model: np.partition(distances(model), middle)[middle])
-    scale = CUT * (1 + 5 / (count - minimum))  # small samples underestimate the median
+    scale = OUTLIER_DISTANCE * (1 + 5 / (count - minimum))  # small samples underestimate the median
     errors, is_inlier = distances(best), np.zeros(count, bool)
     limit = max(floor, scale * float(np.partition(errors, middle)[middle]))
     for _ in range(MAX_ROUNDS):

@@ -15,7 +15,7 @@ import numpy as np
 from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens, panorama_lens
-from clsplat.scene.images import stored_size
+from clsplat.scene.images import read_stored_size
 from clsplat.scene.lookup import FileLookup, Missing, safe_join, unsupported_cameras
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.reader import Parts, Reader
@@ -102,7 +102,7 @@ class Transforms:
         """Return the source and the `time` (None if missing) of every frame.  Raises DataError for invalid times."""
         return [(frame.source, frame.number("time")) for frame in self.frames]
 
-    def points(self, clock: Clock | None = None) -> PointCloud | None:
+    def read_points(self, clock: Clock | None = None) -> PointCloud | None:
         """Return the points, or None without a file of points.  Raises DataError like read_points_ply."""
         path = self.points_path()
         return read_points_ply(path, clock) if path else None
@@ -132,16 +132,16 @@ class FrameFiles(FileLookup):
             files.existing_indices(source, "refuse")
             self.masks[key] = dict(zip(names, files.paths, strict=True))
 
-    def views(self, source: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
+    def make_views(self, source: Path, missing: Missing, clock: Clock | None = None) -> list[View]:
         """Return the views of the frames with photographs.
 
         missing: how to handle missing photographs.  Raises DataError for invalid values and missing files.
         """
         indices = self.existing_indices(source, missing)
         self.find_masks(source, indices)
-        return [self.view(i, clock) for i in indices]
+        return [self.make_view(i, clock) for i in indices]
 
-    def view(self, i: int, clock: Clock | None = None) -> View:
+    def make_view(self, i: int, clock: Clock | None = None) -> View:
         """Return the view of the i-th frame; without a size in the frame, it has the size of its photograph.
 
         Photographs taken with a distorting lens are undistorted when they are read.  Raises DataError for invalid
@@ -151,14 +151,14 @@ class FrameFiles(FileLookup):
         size = None
         if not (frame.number("w") and frame.number("h")):
             try:
-                size = stored_size(path)
+                size = read_stored_size(path)
             except DataError:  # decoding lists all damaged photographs
                 size = self._first_size
         view = make_view(frame, self.names[i], size, clock)
         view = replace(view, image_path=path, mask_path=masks[0], static_path=masks[1])
         return fit_to_photograph(view) if path in self.downscaled_files else view
 
-    def scene(
+    def make_scene(
         self, path: Path, views: list[View], test: Set[str], points: PointCloud | None, background: Background = "black"
     ) -> Scene:
         """Return the scene at `path` with some views of the frames; test: the names of the test views."""
@@ -170,8 +170,8 @@ class FrameFiles(FileLookup):
         """The size of the first readable photograph.  Raises DataError when all are unreadable."""
         for path in self.paths:
             with suppress(DataError):
-                return stored_size(path)
-        return stored_size(self.paths[0])
+                return read_stored_size(path)
+        return read_stored_size(self.paths[0])
 
 
 def _with_png(name: str) -> list[str]:
@@ -192,7 +192,7 @@ def list_frames(parts: Parts, root: Path, *names: str) -> None:
         parts.attempt(lookup.find_masks, parts.path, np.flatnonzero(exists).tolist())
         for i, frame in enumerate(lookup.frames):
             has_size = exists[i] or (frame.value("w") and frame.value("h"))  # otherwise, the missing file is the fault
-            parts.views += filter(None, [parts.attempt(lookup.view, i, clock) if has_size else None])
+            parts.views += filter(None, [parts.attempt(lookup.make_view, i, clock) if has_size else None])
     if files and files[0]:
         path = parts.attempt(files[0].points_path)
         parts.points = parts.attempt(read_ply_table, path) if path else None
@@ -325,10 +325,10 @@ class BlenderReader(Reader):
         files = FrameFiles(
             self.root or path, path, transforms.frames + (test_transforms.frames if test_transforms else [])
         )
-        views = files.views(path if test_transforms else transforms.path, self.missing, clock)
+        views = files.make_views(path if test_transforms else transforms.path, self.missing, clock)
         test = {*files.names[len(transforms.frames) :]}
         # NeRF and later papers render these scenes on white.
-        return files.scene(path, views, test, transforms.points(clock), background="white")
+        return files.make_scene(path, views, test, transforms.read_points(clock), background="white")
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, self.root or parts.path, TRAIN_FILE, TEST_FILE)
@@ -358,7 +358,7 @@ class NerfstudioReader(Reader):
         transforms = Transforms(path / TRANSFORMS_FILE)
         clock = make_clock(transforms.path, transforms.timestamps())
         files = FrameFiles(self.root or path, path, transforms.frames)
-        views = sorted(files.views(transforms.path, self.missing, clock), key=lambda view: view.name)
+        views = sorted(files.make_views(transforms.path, self.missing, clock), key=lambda view: view.name)
         new_names = dict(zip(files.raw_names, files.names, strict=True))
         train, test = (_read_list(transforms, key, new_names) for key in ("train_filenames", "test_filenames"))
         if train is None and test is None:
@@ -366,7 +366,7 @@ class NerfstudioReader(Reader):
         split_views = views if train is None else [view for view in views if view.name in train | (test or set())]
         if len(split_views) < len(views):
             logger.info("%s: skipped %d images that no split lists", transforms.path, len(views) - len(split_views))
-        return files.scene(path, split_views, test or set(), transforms.points(clock))
+        return files.make_scene(path, split_views, test or set(), transforms.read_points(clock))
 
     def list_parts(self, parts: Parts) -> None:
         list_frames(parts, self.root or parts.path, TRANSFORMS_FILE)
@@ -412,10 +412,10 @@ class MultiscaleReader(Reader):
         train, test = (_read_frames(path / METADATA_FILE, splits, name) for name in ("train", "test"))
         files = FrameFiles(self.root or path, path, train + test)
         levels = {name: frame.number("label") or 0 for name, frame in zip(files.names, files.frames, strict=True)}
-        views = [replace(view, downscale=2 ** levels[view.name]) for view in files.views(path, self.missing)]
+        views = [replace(view, downscale=2 ** levels[view.name]) for view in files.make_views(path, self.missing)]
         points = path / POINTS_FILE
         cloud = read_points_ply(points) if points.is_file() else None
-        return files.scene(path, views, {*files.names[len(train) :]}, cloud, background="white")
+        return files.make_scene(path, views, {*files.names[len(train) :]}, cloud, background="white")
 
     def list_parts(self, parts: Parts) -> None:
         super().list_parts(parts)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from clsplat.core.errors import DataError, PoseError, quote
 from clsplat.formats.splats import EXPECTED_TIME, is_timestamp
 from clsplat.scene.camera import FACES, MODELS, Camera, Lens, intern_lens
-from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image, stored_size
+from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image, read_stored_size
 
 Floats = NDArray[np.floating]
 ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are checked to 1e-3, and inverting adds to the error
@@ -330,7 +330,7 @@ def needs_rotation(view: View, path: Path, read_size: Callable[[bool], Size]) ->
 
 def fit_to_photograph(view: View) -> View:
     """Return the view with its camera scaled to its photograph if that is smaller and has the same aspect ratio."""
-    (width, height), camera = stored_size(view.image_path), view.lens or view.camera
+    (width, height), camera = read_stored_size(view.image_path), view.lens or view.camera
     x_scale, y_scale = width / camera.width, height / camera.height
     if x_scale >= 1 or abs(height - x_scale * camera.height) > MAX_ROUNDING:
         return view

@@ -34,14 +34,14 @@ def _require_text(value: Any) -> Any:
 
 
 class MissingViewError(DataError):
-    """A selection does not match the photographs of the dataset.  It may match those after `prepare`."""
+    """A selection does not match the photographs of the dataset.  It may match the output of `prepare`."""
 
 
 class ViewSelection(Settings):
     """Views by name: every n-th, those of a list, or those of a file with one name per line.
 
     A listed name may be the end of a view's name: `0042`, `0042.jpg` and `images/0042.jpg` name the same photograph,
-    also when it was prepared as `0042.png`.
+    even if `prepare` wrote it as `0042.png`.
     """
 
     every: Annotated[int, Field(gt=0)] | None = None
@@ -208,7 +208,7 @@ def _unknown_name_error(name: str, names: Sequence[str], source: str) -> DataErr
 
 # Split a scene into training, validation and test views.
 
-FOLD, FOLD_OFFSET = 8, 4  # every 8th training view by name, but not the first, often at the end of a camera path
+FOLD, FOLD_OFFSET = 8, 4  # every 8th training view by name, without the first, where a camera path often ends
 MIN_TRAIN = 4  # smallest number of training views from which some can be held out for validation
 
 

@@ -19,10 +19,10 @@ MIN_AGREEMENT, MAX_TILT = 0.5, 75.0  # a mean up axis longer than MIN_AGREEMENT 
 PRIOR = 1e-3  # weight of the center of the splats, which determines the distance if all axes are parallel
 START_CAMERA = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a scene without views
 QUANTILES = 0.05, 0.95  # of the splats along each axis: the faces of the box to look at
-DISTANCE = 2.2  # of the start view from the center of the box, in halves of its diagonal
+DISTANCE = 2.2  # of the start view from the center of the box, divided by half the diagonal of the box
 TOWARD_START = np.array([0.35, -0.25, -0.9])  # from the center
-MOST, MARGIN = 0.999, 1.05  # of the splats, which the start view shows as a whole, and their space
-MAX_ZOOM_OUT = 2.0  # times the distance; beyond it, the splats have a background, which is not framed
+VISIBLE_FRACTION, MARGIN = 0.999, 1.05  # of the splats in the start view, and the space around them
+MAX_ZOOM_OUT = 2.0  # times the distance; splats that need more have a background, which may be outside the image
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Viewpoint:
             up = np.array([0.0, -1.0, 0.0])  # up in an OpenCV camera
             radius = spread or 1.0
             start = View.looking_at(center + DISTANCE * radius * TOWARD_START, center, up, START_CAMERA, "start")
-            distance = _distance_of_whole(start, means - center) if len(means) else 0.0
+            distance = _distance_to_show_all(start, means - center) if len(means) else 0.0
             if DISTANCE * radius < distance <= MAX_ZOOM_OUT * DISTANCE * radius:
                 start = View.looking_at(center + distance * TOWARD_START, center, up, START_CAMERA, "start")
             return cls(center, up, radius, START_CAMERA.fx, start)
@@ -64,7 +64,7 @@ class Viewpoint:
         return cls(pivot, up_direction(views), radius, float(np.median([view.camera.fx for view in views])), first)
 
 
-def _distance_of_whole(start: View, offsets: NDArray[np.floating]) -> float:
+def _distance_to_show_all(start: View, offsets: NDArray[np.floating]) -> float:
     """Return the distance from the center at which `start` shows nearly all points, as multiples of TOWARD_START.
 
     offsets: of the points from the center, [N, 3].
@@ -72,7 +72,7 @@ def _distance_of_whole(start: View, offsets: NDArray[np.floating]) -> float:
     right, down, forward = start.world_to_camera[:, :3] @ offsets.T
     camera = start.camera
     sides = np.maximum(np.abs(right) * camera.fx / camera.cx, np.abs(down) * camera.fy / camera.cy)
-    return MARGIN * float(np.quantile(sides - forward, MOST)) / float(np.linalg.norm(TOWARD_START))
+    return MARGIN * float(np.quantile(sides - forward, VISIBLE_FRACTION)) / float(np.linalg.norm(TOWARD_START))
 
 
 def circle_views(points: NDArray[np.floating], count: int = 36) -> list[View]:

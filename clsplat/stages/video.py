@@ -13,7 +13,7 @@ from pydantic import Field, field_validator
 from clsplat.core.errors import ConfigError, quote
 from clsplat.core.progress import counted, listening
 from clsplat.core.settings import InputPath
-from clsplat.scene.images import image_size, read_image, write_image
+from clsplat.scene.images import read_image, read_image_size, write_image
 from clsplat.scene.view import View
 from clsplat.training.run import Run
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
@@ -99,7 +99,7 @@ class Timelapse(Stage):
             raise ConfigError(
                 f"timelapse: {quote(self.folder)} has no snapshots; set 'folder' to the folder of the snapshot stage"
             )
-        size = image_size(files[-1])
+        size = read_image_size(files[-1])
         with encoding.open_video(run.out / self.file, size, self.fps) as write:
             for path in run.status.counted(run.until_interrupted(files), "frames", len(files)):
                 write(letterbox(np.asarray(read_image(path), np.uint8)[:, :, :3], size))  # one size for all

@@ -21,10 +21,10 @@ TEXTS = {  # what turns results into lines of text, which the commands print
     "clsplat.runs.status": {"status_text", "summary"},
     "clsplat.runs.verify": {"format_files", "verdict"},
     "clsplat.sweeps.status": {"overview_text"},
-    "clsplat.workflows.align": {"table"},
-    "clsplat.workflows.blocks": {"status_table", "table"},
-    "clsplat.workflows.compress": {"table"},
-    "clsplat.workflows.lod": {"table"},
+    "clsplat.workflows.align": {"format_table"},
+    "clsplat.workflows.blocks": {"status_table", "format_table"},
+    "clsplat.workflows.compress": {"format_table"},
+    "clsplat.workflows.lod": {"format_table"},
 }
 
 

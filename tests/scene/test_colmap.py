@@ -51,7 +51,7 @@ def assert_same_images(folder: Path, reconstruction) -> None:
 
 
 def assert_same_points(folder: Path, reconstruction) -> None:
-    points = read_point_table(folder).cloud()
+    points = read_point_table(folder).to_point_cloud()
     assert points is not None
     assert points.colors.dtype == np.float32
     theirs = reconstruction.points3D.values()
@@ -257,6 +257,6 @@ def test_nonfinite_points_are_dropped(tmp_path: Path, kind: str, caplog: pytest.
 def test_hundred_thousand_points_are_read(tmp_path: Path) -> None:
     row = struct.pack("<Q3d3BdQ", 1, 1.0, 2.0, 3.0, 10, 20, 30, 0.5, 3) + struct.pack("<6I", *range(6))
     (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 100_000) + row * 100_000)
-    points = read_point_table(tmp_path).cloud()
+    points = read_point_table(tmp_path).to_point_cloud()
     assert points is not None
     assert len(points) == 100_000

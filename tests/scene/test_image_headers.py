@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clsplat.core.errors import DataError
-from clsplat.scene.images import Header, image_size, read_header
+from clsplat.scene.images import Header, read_header, read_image_size
 from tests.support.data_sets import data_set
 from tests.support.pictures import with_exif
 
@@ -37,7 +37,7 @@ def test_real_photographs(name):
     assert files
     for file in files[:10]:
         header = read_header(file)
-        assert (header.width, header.height) == image_size(file)
+        assert (header.width, header.height) == read_image_size(file)
         assert header.is_complete
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from clsplat.core.errors import OutputError
 from clsplat.scene.camera import Camera
-from clsplat.scene.images import image_size, read_image, write_image
+from clsplat.scene.images import read_image, read_image_size, write_image
 from clsplat.scene.lookup import require_files
 from clsplat.scene.view import View, load_image
 from tests.support.data_sets import data_set
@@ -53,7 +53,7 @@ def test_name_with_unicode_and_spaces(tmp_path: Path) -> None:
     path = tmp_path / "fôx 日本.png"
     stored(tmp_path / "a.png", pixels).rename(path)
     np.testing.assert_array_equal(load_image(make_view(path, 6, 4)), pixels)
-    assert image_size(path) == (6, 4)
+    assert read_image_size(path) == (6, 4)
 
 
 def test_gray_becomes_rgb(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import scipy
 from scipy.spatial.transform import Rotation
 
 from clsplat.core.errors import DataError
-from clsplat.scene.control import AXIS, FLATTENING, to_utm
+from clsplat.scene.control import FLATTENING, SEMI_MAJOR_AXIS, to_utm
 from clsplat.scene.similarity import UP, Correspondences, Similarity, level, rotation_between
 from clsplat.scene.viewpoint import ground_plane
 
@@ -71,7 +71,9 @@ def test_utm_of_known_places():
     np.testing.assert_allclose(tower, [[630084, 4833438, 100]], atol=1)
     assert epsg == 32617
     e2 = FLATTENING * (2 - FLATTENING)
-    arc = scipy.integrate.quad(lambda p: AXIS * (1 - e2) / (1 - e2 * math.sin(p) ** 2) ** 1.5, 0, math.radians(70))[0]
+    arc = scipy.integrate.quad(
+        lambda p: SEMI_MAJOR_AXIS * (1 - e2) / (1 - e2 * math.sin(p) ** 2) ** 1.5, 0, math.radians(70)
+    )[0]
     position, epsg = to_utm(np.array([[70.0, 9.0, 0.0]]))
     np.testing.assert_allclose(position, [[500_000, 0.9996 * arc, 0]], atol=1e-3)
     assert epsg == 32632

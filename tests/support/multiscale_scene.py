@@ -51,7 +51,7 @@ def pyramid(pixels: NDArray[np.uint8], levels: int) -> list[NDArray[np.uint8]]:
 def _write_split(transforms: Transforms, name: str, out: Path, levels: int) -> dict[str, Any]:
     """Write one split's images and return its columns, one value per image."""
     folder, rows = transforms.path.parent, []
-    views = filter(None, FrameFiles(folder, folder, transforms.frames).views(transforms.path, "refuse"))
+    views = filter(None, FrameFiles(folder, folder, transforms.frames).make_views(transforms.path, "refuse"))
     for i, (frame, view) in enumerate(zip(transforms.frames, views, strict=True)):
         pixels = read_image(view.image_path)
         height, width = pixels.shape[:2]

@@ -6,7 +6,7 @@ import pytest
 
 from clsplat.core.errors import ConfigError
 from clsplat.pipeline.loading import load
-from clsplat.scene.images import image_size, read_image
+from clsplat.scene.images import read_image, read_image_size
 from clsplat.viewer.video.encoding import count_frames
 from tests.support.commands import clsplat as command
 from tests.support.runs import FEW, digest, train
@@ -45,7 +45,7 @@ def test_images_and_videos_change_no_bits_of_the_model(run, few_steps):
 def test_images_are_written_periodically_and_joined_to_a_video(run):
     names = [path.name for path in sorted((run / "timelapse").iterdir())]
     assert names == [f"step_{step:06d}.png" for step in range(2, 13, 2)]
-    assert {image_size(path) for path in (run / "timelapse").iterdir()} == {(40, 40)}
+    assert {read_image_size(path) for path in (run / "timelapse").iterdir()} == {(40, 40)}
     assert count_frames(run / "timelapse.webm") == 6
     assert count_frames(run / "video.webm") == 5
     last, render = (read_image(run / name) for name in ("timelapse/step_000012.png", "renders/test/r_001.png"))

@@ -56,7 +56,7 @@ def test_levels_are_trained_and_measured(trained, few_steps, tiny_scene):
 def test_numbers_are_formatted_as_in_other_commands(monkeypatch, caplog):
     caplog.set_level("INFO")
     monkeypatch.setattr(lod, "decimate", lambda model, keep: range(1200))
-    lod._levels(range(2400), LodPlan(levels=2), None)
+    lod._decimate_repeatedly(range(2400), LodPlan(levels=2), None)
     assert "level 1: 1,200 Gaussians" in caplog.text
 
 
