@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from .shapes import Array, Shape, align, disc, dot, rotate, unit
+from .shapes import Array, Shape, align, disc, dot, normalize, rotate
 
 BLOCK = 65536  # rays per block: smaller blocks need more calls, larger blocks more memory
 SURFACE_OFFSET = 1e-6  # scene units: secondary rays start this far above the surface
 
 # Light: one jittered shadow ray and one sky ray per sample; a pixel's grid x grid samples share the work.
-KEY_DIRECTION = unit(np.array([[0.45], [-0.62], [0.95]]))
+KEY_DIRECTION = normalize(np.array([[0.45], [-0.62], [0.95]]))
 KEY_LIGHT = np.array([[1.0], [0.95], [0.86]])
 KEY_WIDTH = 0.11  # radius of the light, as a fraction of its distance
 SKY_LIGHT = np.array([[0.36], [0.41], [0.50]])
@@ -65,7 +65,7 @@ class World:
         key, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighboring samples
         normal = self.by_shape(Shape.normal, index, points)
         start = points + SURFACE_OFFSET * normal
-        to_key = unit(align(KEY_DIRECTION, KEY_WIDTH * key[0], KEY_WIDTH * key[1], 1.0))
+        to_key = normalize(align(KEY_DIRECTION, KEY_WIDTH * key[0], KEY_WIDTH * key[1], 1.0))
         key_light = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
         to_sky = align(normal, sky[0], sky[1], np.sqrt(1 - dot(sky, sky)))
         occluders = self if self.canopy is None else replace(self, shapes=self.canopy)
@@ -83,7 +83,7 @@ class World:
         """
         focal = 0.5 * size / np.tan(0.5 * self.camera_angle_x)
         directions = np.array([(x - 0.5 * size) / focal, (0.5 * size - y) / focal, np.full(x.shape, -1.0)])
-        return pose[:3, 3:], unit(rotate(pose[:3, :3], directions))
+        return pose[:3, 3:], normalize(rotate(pose[:3, :3], directions))
 
     def photograph(self, pose: Array, size: int) -> NDArray[np.uint8]:
         """Render one view, [size, size, 4] RGBA: colors with gamma 2 (close to sRGB); alpha is the covered fraction."""
@@ -115,7 +115,7 @@ def camera_pose(position: Array, backward: Array) -> Array:
     position: in scene units, [3]
     backward: a unit vector, [3]
     """
-    right = unit(np.cross([0.0, 0.0, 1.0], backward))
+    right = normalize(np.cross([0.0, 0.0, 1.0], backward))
     pose = np.eye(4)
     pose[:3] = np.stack([right, np.cross(backward, right), backward, position], axis=1)
     return pose

@@ -30,7 +30,7 @@ def rotate(matrix: Array, v: Array) -> Array:
     return np.asarray(matrix[:, :1] * v[0] + matrix[:, 1:2] * v[1] + matrix[:, 2:] * v[2])
 
 
-def unit(v: Array) -> Array:
+def normalize(v: Array) -> Array:
     """Scale columns to unit length."""
     return np.asarray(v / np.sqrt(dot(v, v)))
 

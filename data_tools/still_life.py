@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from .shapes import Array, Cuboid, Cylinder, Shape, Sphere, Vector, dot, spiral, unit
+from .shapes import Array, Cuboid, Cylinder, Shape, Sphere, Vector, dot, normalize, spiral
 
 SCENE_RADIUS = 1.25  # radius of the table, scene units
 SCENE_VERSION = 1  # increase it when the images change, so that existing folders count as incomplete
@@ -101,7 +101,7 @@ def beach_ball(p: Array) -> Array:
 
 def dotted(p: Array) -> Array:
     """Paint evenly distributed white dots on a red ball."""
-    direction = unit(p)
+    direction = normalize(p)
     nearest = np.maximum.reduce([dot(d, direction) for d in spiral(36, -90, 90)])
     return mix((0.62, 0.02, 0.03), (0.82, 0.79, 0.74), nearest > np.cos(0.19))
 

@@ -54,7 +54,7 @@ def read_compressed_ply(path: Path) -> SplatFile:
             require_size(path, size, section.start + length, f"{section.count} rows of '{name}'")
             file.seek(section.start)
             tables[name] = np.ndarray(section.count, section.dtype, file.read(length))
-    chunks, vertices = _require_match(path, header, tables)
+    chunks, vertices = _check_chunks(path, header, tables)
     require_memory(path, len(vertices), MAX_DEGREE if "sh" in tables else 0)
     chunk = np.repeat(np.arange(len(chunks)), CHUNK)[: len(vertices)]
     color, alpha = _decode_colors(vertices, chunks, chunk)
@@ -69,8 +69,8 @@ def read_compressed_ply(path: Path) -> SplatFile:
     return SplatFile(parameters, read_rendering_comment(path, header), render_mode(header))
 
 
-def _require_match(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the chunks and vertices.  Raises DataError if they are missing or do not match."""
+def _check_chunks(path: Path, header: PlyHeader, tables: dict[str, NDArray[Any]]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the chunks and the vertices.  Raises DataError if either is missing, or if there are too few chunks."""
     if not {"chunk", "vertex"} <= tables.keys() or not set(_BOUNDS[:12]) <= set(tables["chunk"].dtype.names or ()):
         raise DataError(f"{path}: a compressed PLY needs the ranges of its splats in 'element chunk'; export it again")
     if not is_compressed(header) or any(header.dtype[name].str[1:] != "u4" for name in PACKED):

@@ -37,13 +37,13 @@ from clsplat.formats.splats import (
     WriteOptions,
     concatenate,
     flip_axes,
+    normalize_quats,
     opacities,
     opacities_to_logits,
     require_gaussians,
     require_memory,
     scales_to_logs,
     transform,
-    unit,
 )
 from clsplat.formats.spz import MAX_RATIO, MIN_LIMIT, decode_spz
 
@@ -55,7 +55,7 @@ PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|texture)_.*|.*spz.*")  # or no effect
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-MAX_READS = 8  # average number of reads of a byte, because equal columns may share an accessor
+MAX_READS = 8  # largest average number of reads of a byte; equal columns may share an accessor
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
 FLIP_4 = np.diag([*FLIP, 1.0])  # converts between the axes of glTF and of a PLY
 LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # signs that convert the axes of a PLY
@@ -116,7 +116,7 @@ class Gltf:
         else:
             part = self._read_attributes(attributes)
         if space == LINEAR:
-            self.notes.add("its colors are linear: they are converted to sRGB, exactly where they have no harmonics")
+            self.notes.add("its colors are linear: they are converted to sRGB, which is exact only for SH degree 0")
             bands = np.concatenate([part["sh_base"], part["sh_rest"]], axis=1)
             bands = map_colors(bands.reshape(len(bands), -1, 3), _to_srgb).reshape(bands.shape).astype(np.float32)
             part |= {"sh_base": bands[:, :3], "sh_rest": bands[:, 3:]}
@@ -361,7 +361,7 @@ def read_gltf(path: Path) -> SplatFile:
         ) from error
     for note in sorted(gltf.notes):
         LOG.warning("%s: %s", path, note)
-    if rendering.pop("origin", None) and placement is not None:  # the node has it, perhaps changed
+    if rendering.pop("origin", None) and placement is not None:  # the node's translation is the current origin
         rendering["origin"] = placement[:3, 3].tolist()
         placement[:3, 3] = 0
     return SplatFile(
@@ -449,7 +449,7 @@ def _make_attributes(p: Parameters) -> dict[str, NDArray[Any]]:
         scale = np.minimum(np.exp(p["log_scales"].astype(np.float64)), np.finfo(np.float32).max)
     tables: dict[str, NDArray[Any]] = {
         "POSITION": p["means"],
-        f"{PREFIX}ROTATION": np.roll(unit(p["quats"]), -1, axis=1),
+        f"{PREFIX}ROTATION": np.roll(normalize_quats(p["quats"]), -1, axis=1),
         f"{PREFIX}SCALE": scale,
         f"{PREFIX}OPACITY": alpha,
     }
@@ -507,7 +507,7 @@ def write_usda(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     tables = {
         "float3[] extent": extent,
         "point3f[] positions": p["means"],
-        "quatf[] orientations": unit(p["quats"]),
+        "quatf[] orientations": normalize_quats(p["quats"]),
         "float3[] scales": scales,
         "float[] opacities": opacities(p["logit_opacity"]),
         "float3[] radiance:sphericalHarmonicsCoefficients": harmonics,

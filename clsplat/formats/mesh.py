@@ -47,8 +47,8 @@ class Mesh:
 
     def select(self, is_kept: NDArray[np.bool_]) -> "Mesh":
         """Return the mesh with only the faces of a mask, [F], and the vertices of these faces."""
-        used, faces = np.unique(self.faces[is_kept], return_inverse=True)
-        return Mesh(self.vertices[used], faces.reshape(-1, 3), self.colors[used])
+        rows, faces = np.unique(self.faces[is_kept], return_inverse=True)
+        return Mesh(self.vertices[rows], faces.reshape(-1, 3), self.colors[rows])
 
 
 def write_ply(path: Path, mesh: Mesh, origin: Floats) -> None:
@@ -99,8 +99,8 @@ def write_glb(path: Path, mesh: Mesh, origin: Floats) -> None:
     }
     material = {"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}
     tree = {"materials": [{**material, "extensions": {UNLIT: {}}}], "extensionsUsed": [UNLIT]}
-    primitive, place = {"mode": TRIANGLES, "material": 0}, origin.tolist() if origin.any() else None
-    write_primitive(path, attributes, primitive, tree, place, mesh.faces.astype("<u4"))
+    primitive, translation = {"mode": TRIANGLES, "material": 0}, origin.tolist() if origin.any() else None
+    write_primitive(path, attributes, primitive, tree, translation, mesh.faces.astype("<u4"))
 
 
 WRITERS: dict[str, Callable[[Path, Mesh, Floats], None]] = {".ply": write_ply, ".obj": write_obj, ".glb": write_glb}

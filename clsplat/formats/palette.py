@@ -20,8 +20,8 @@ def fit_codebook(values: NDArray[np.floating], step: float | None = None) -> NDA
 
     If there are at most ENTRIES distinct values, these are returned exactly, and the last one is repeated.  Otherwise,
     the same is tried for `values` rounded to multiples of `step`.  If these also have too many distinct values,
-    rounds of Lloyd's iteration (1982) compute the codebook.  Between rounds, two cells are merged if this costs less
-    than splitting another gains.
+    rounds of Lloyd's iteration (1982) compute the codebook.  Between rounds, pairs of cells are merged and other cells
+    are split while this reduces the error.
     """
     sorted_values = np.sort(values.astype(np.float64) + 0.0, axis=None)  # makes -0 equal to 0, whose order is undefined
     for candidates in [sorted_values] + ([np.rint(sorted_values / step) * step] if step else []):
@@ -29,7 +29,7 @@ def fit_codebook(values: NDArray[np.floating], step: float | None = None) -> NDA
         if len(unique_values) <= ENTRIES:
             return np.concatenate([unique_values, np.full(ENTRIES - len(unique_values), unique_values[-1])])
     cells = _Cells(sorted_values)
-    cuts = _first_cuts(sorted_values)
+    cuts = _initial_cuts(sorted_values)
     for _ in range(CODEBOOK_ROUNDS):
         for _ in range(LLOYD_STEPS):
             means = np.sort(cells.means(cuts))
@@ -81,7 +81,7 @@ def _prefix_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([-lower, [0.0], upper])
 
 
-def _first_cuts(sorted_values: NDArray[np.float64]) -> NDArray[np.int64]:
+def _initial_cuts(sorted_values: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return cuts with a density proportional to the cube root of that of the values (Panter and Dite 1951)."""
     edges = np.linspace(sorted_values[0], sorted_values[-1], 4 * ENTRIES + 1)
     positions = np.searchsorted(sorted_values, edges)

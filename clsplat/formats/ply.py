@@ -80,7 +80,7 @@ class PlyHeader:
     dtype: np.dtype[Any]  # of one vertex, in the byte order of the file
     start: int  # offset of the vertices, bytes; in an ascii file, size of the header
     lines_before: int  # in an ascii file: lines between header and vertices
-    sections: dict[str, Section] = field(default_factory=dict)  # in a binary file: all elements before one with a list
+    sections: dict[str, Section] = field(default_factory=dict)  # in a binary file: elements before the first list
 
 
 @dataclass
@@ -128,7 +128,7 @@ def parse_ply_header(path: Path, data: bytes) -> PlyHeader:
                 )
     if not encoding:
         raise DataError(f"{path}: the PLY header has no 'format ascii 1.0' or 'format binary_…'; export it again")
-    return _header(path, encoding, tuple(comments), elements, end.end())
+    return _make_header(path, encoding, tuple(comments), elements, end.end())
 
 
 def read_ascii(path: Path, data: bytes, header: PlyHeader) -> NDArray[Any]:
@@ -169,7 +169,9 @@ def format_ply_header(comments: Iterable[str], **elements: tuple[int, Iterable[s
     return "\n".join([*lines, "end_header", ""]).encode()
 
 
-def _header(path: Path, encoding: str, comments: tuple[str, ...], elements: list[_Element], start: int) -> PlyHeader:
+def _make_header(
+    path: Path, encoding: str, comments: tuple[str, ...], elements: list[_Element], start: int
+) -> PlyHeader:
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise DataError(

@@ -35,11 +35,11 @@ from clsplat.formats.palette import fit_codebook, fit_palette, nearest_entries, 
 from clsplat.formats.ply import read_extras
 from clsplat.formats.sog_quantize import (
     compensate_base,
+    fit_tree_palette,
     log_weights,
     round_means,
     round_quats,
     round_to,
-    tree_palette,
     visible_form,
 )
 from clsplat.formats.splats import (
@@ -50,12 +50,12 @@ from clsplat.formats.splats import (
     SplatFile,
     WriteOptions,
     logits,
+    normalize_quats,
     opacities,
     require_gaussians,
     require_in_range,
     require_memory,
     sh_coefficients,
-    unit,
 )
 
 # The files of a SOG, in a ZIP or in the folder of a meta.json.
@@ -129,7 +129,7 @@ class SogFiles:
 
 
 @contextmanager
-def sog_files(path: Path) -> Iterator[SogFiles]:
+def open_sog(path: Path) -> Iterator[SogFiles]:
     """Open the files of a SOG folder or ZIP.  Raises DataError if the ZIP is missing or damaged."""
     if path.suffix.lower() == ".json":
         yield SogFiles(path)
@@ -158,7 +158,7 @@ def looks_like_sog(data: bytes) -> bool:
 
 def read_sog(path: Path) -> SplatFile:
     """Read a `.sog` file, or a SOG folder, given its meta.json.  Raises DataError if a file is missing or damaged."""
-    with sog_files(path) as files:
+    with open_sog(path) as files:
         try:
             meta = json.loads(files.read(META))
         except (ValueError, RecursionError) as error:
@@ -372,7 +372,7 @@ def write_ordered_sog(path: Path, splats: SplatFile, weights: NDArray[np.float64
         return name
 
     meta["means"] = _write_means(p, write_image)
-    largest_index, components = smallest_three(unit(p["quats"]))
+    largest_index, components = smallest_three(normalize_quats(p["quats"]))
     levels = np.clip(np.rint(255 * (components * 0.5**0.5 + 0.5)), 0, 255)
     meta["quats"] = {"files": [write_image("quats", *levels.T, LARGEST_W + largest_index)]}
     for name, table, alpha in (("scales", "log_scales", []), ("sh0", "sh_base", [_alpha(p)])):
@@ -433,7 +433,7 @@ class Harmonics:
         refine: Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.int64]]],
         step: float | None = None,
     ) -> "Harmonics":
-        """Fit a small palette to SH coefficients, [N, c].  Training with its `values` makes saving lossless.
+        """Fit a small palette to SH coefficients, [N, c].  A model with its `values` is saved without loss.
 
         weights: weight of each splat's squared error, [N].  refine: receives palette vectors, [E, c], and returns
         better ones and the label of each splat.  step: codebook values are rounded to multiples of this if at most 256
@@ -479,7 +479,7 @@ def _quantize(
     if harmonics and rest.any():
         return p, harmonics
     if rest.any():
-        harmonics = Harmonics.from_vectors(*tree_palette(rest, weights, max_entries, MEDIAN_STEPS[options.quality]))
+        harmonics = Harmonics.from_vectors(*fit_tree_palette(rest, weights, max_entries, MEDIAN_STEPS[options.quality]))
         base = compensate_base(base, rest - harmonics.values, visible_form(rest))
     if options.quality == "high":
         return {**p, "sh_base": base}, harmonics

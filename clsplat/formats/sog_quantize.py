@@ -14,7 +14,7 @@ from clsplat.core.quaternions import multiply
 from clsplat.formats.packing import from_smallest_three, smallest_three
 from clsplat.formats.palette import LEVELS as PALETTE_LEVELS
 from clsplat.formats.palette import robust_max
-from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, unit
+from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, normalize_quats
 
 Floats = NDArray[np.floating]
 LEVELS = 65535  # of a coordinate
@@ -70,7 +70,7 @@ def round_quats(quats: Floats, log_scales: Floats, step: int) -> tuple[NDArray[n
     Axes can be permuted and flipped, so 24 pairs of rotation and scales represent the same Gaussian.  The pair with the
     smallest rotation angle is used: w is then the largest component, and the others are small.
     """
-    q, rows = unit(quats), np.arange(len(quats))
+    q, rows = normalize_quats(quats), np.arange(len(quats))
     max_abs_w, rotations = np.full(len(q), -1.0), np.zeros(len(q), np.intp)
     for index, (w, x, y, z) in enumerate(_ROTATIONS):
         abs_w = np.abs(q[:, 0] * w - q[:, 1] * x - q[:, 2] * y - q[:, 3] * z)
@@ -171,7 +171,7 @@ MAX_STEP = 64.0  # levels
 Labels = NDArray[np.int64]
 
 
-def tree_palette(
+def fit_tree_palette(
     rest: NDArray[np.float32], log_weights: NDArray[np.float64], max_entries: int, median_step: float
 ) -> tuple[NDArray[np.float64], Labels]:
     """Return at most `max_entries` palette vectors, [E, 3 K], for SH [N, 3 K], and the label of each Gaussian, [N].

@@ -27,6 +27,7 @@ from clsplat.formats.splats import (
     concatenate,
     logits,
     logs,
+    normalize_quats,
     opacities,
     reorder_columns,
     require_gaussians,
@@ -34,7 +35,6 @@ from clsplat.formats.splats import (
     require_size,
     scales_to_logs,
     sh_coefficients,
-    unit,
 )
 
 LOG = logging.getLogger("clsplat")
@@ -66,7 +66,7 @@ def read_splat(path: Path) -> SplatFile:
     color = rows["color"] / 255.0
     parameters: Parameters = {
         "means": rows["position"].astype(np.float32),
-        "quats": unit(rows["rotation"] / 128.0 - 1).astype(np.float32),
+        "quats": normalize_quats(rows["rotation"] / 128.0 - 1).astype(np.float32),
         "log_scales": scales_to_logs(rows["scale"], notes),
         "logit_opacity": logits(color[:, 3:]),
         "sh_base": ((color[:, :3] - 0.5) / SH_C0).astype(np.float32),
@@ -96,7 +96,7 @@ def write_splat(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     if p["sh_rest"].shape[1]:
         LOG.warning("%s: .splat stores no SH coefficients, so colors do not depend on the view; other formats do", path)
     rows["color"] = np.clip(np.rint(255 * color), 0, 255)
-    rows["rotation"] = np.clip(np.rint(128 * unit(p["quats"]) + 128), 0, 255)
+    rows["rotation"] = np.clip(np.rint(128 * normalize_quats(p["quats"]) + 128), 0, 255)
     return write_bytes(path, rows[order].tobytes())
 
 

@@ -84,9 +84,8 @@ MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in BOUNDED; viewers and codebooks fail beyond it
 BOUNDED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
-MIN_OUTSIDE = (
-    0.5  # fraction of values outside of their range that shows another unit; mirrored axes have negative scales
-)
+# fraction of the values outside their range from which another unit is assumed; mirrored axes have negative scales, too
+MIN_OUTSIDE = 0.5
 MAX_EXPONENT = 700.0  # of exp in float64
 MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
@@ -193,7 +192,7 @@ def logs(scales: Floats) -> NDArray[np.float32]:
     return np.where(scales == 0, FLAT_LOG_SCALE, log_scales).astype(np.float32)
 
 
-def unit(quats: Floats) -> NDArray[np.float64]:
+def normalize_quats(quats: Floats) -> NDArray[np.float64]:
     """Normalize quaternions, [N, 4]; quaternions of length 0 become (1, 0, 0, 0)."""
     doubles = quats.astype(np.float64)
     length = np.linalg.norm(doubles, axis=1, keepdims=True)

@@ -57,6 +57,7 @@ from clsplat.formats.splats import (
     flip_axes,
     flip_axes_in_place,
     logits,
+    normalize_quats,
     opacities,
     require_gaussians,
     require_in_range,
@@ -64,7 +65,6 @@ from clsplat.formats.splats import (
     sh_coefficients,
     transform,
     typical_size,
-    unit,
     warn_dropped,
 )
 
@@ -79,12 +79,13 @@ MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # fractional bits of positions; the second for quality `high`
 COARSE, MAX_FRACTION = 2, 23  # models smaller than 2^-COARSE scene units get more bits; readers accept up to 23
 ROWS = 1 << 13  # rows decoded at once, to limit temporary memory
-# steps of SH coefficients, in levels of 256: for a Gaussian of median weight, typical and at most; at most for any
+# steps of SH coefficients, in levels of 256: the typical and the largest step for a Gaussian of median weight, and the
+# largest step for any Gaussian
 MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
 MAX_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
 # step of positions for a Gaussian of median weight, relative to its smallest scale
 POSITION_STEP = {"small": 0.5, "balanced": 0.5, "high": 0.0}
-# steps of colors, in levels of 255: for a Gaussian of median weight, and at most
+# steps of colors, in levels of 255: for a Gaussian of median weight, and the largest
 BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
 MAX_ZEROS = 16  # last bits of a position that may be zeroed
 QUAT_STEP = {"small": 4, "balanced": 4, "high": 1}  # step of quaternions, in levels of 511
@@ -219,9 +220,10 @@ def pack_planes(
 
 
 def _encode_positions(p: Parameters, weights: NDArray[np.float64], fraction: int, relative: float) -> bytes:
-    """Encode coordinates in 24 bits, rounded to power-of-two steps of `relative` times a Gaussian's smallest scale.
+    """Encode coordinates in 24 bits, rounded to multiples of a step for each Gaussian.
 
-    Gaussians of small weight have larger steps.
+    The step is a power of two near `relative` times the smallest scale for a Gaussian of median weight, and
+    proportional to 1 / sqrt(weight).
     """
     size = p["log_scales"].min(axis=1, keepdims=True).astype(np.float64) / np.log(2) - weights[:, None] / 2
     step = np.exp2(np.clip(np.floor(size + np.log2(relative) + fraction), 0, MAX_ZEROS)) if relative else 1.0
@@ -232,7 +234,7 @@ def _encode_positions(p: Parameters, weights: NDArray[np.float64], fraction: int
 
 def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
     """Encode the three smallest components of quaternions in 9 bits each, as multiples of `step`, with signs."""
-    largest_index, components = smallest_three(np.roll(unit(quats), -1, axis=1))
+    largest_index, components = smallest_three(np.roll(normalize_quats(quats), -1, axis=1))
     multiples = np.rint(511 / step * np.abs(components) * 2**0.5) * step
     levels = np.minimum(multiples, 511).astype(np.uint32)
     levels |= (components < 0).astype(np.uint32) << np.uint32(9)
@@ -315,7 +317,7 @@ def _open_zstd(data: bytes) -> tuple[Any, type[Exception]]:
 WRITTEN_VERSION = 3  # more programs read it than version 4
 HEADER4 = 32  # bytes, in version 4
 LEVEL = 12  # of deflate
-CODE_RATIO = 1032  # largest compression ratio of deflate
+DEFLATE_RATIO = 1032  # largest compression ratio of deflate
 MAX_RATIO = 32  # largest accepted compression ratio; real files have less than 8
 MIN_LIMIT = 1 << 26  # bytes of planes that a file of any size may decompress to: 0.3 GB in memory
 BLOCK = 1 << 16  # bytes read at once
@@ -370,8 +372,8 @@ def _gzip(data: bytes) -> bytes:
     """Compress bytes as one gzip member."""
     import deflate  # imported here because only this function needs it
 
-    check = struct.pack("<2I", zlib.crc32(data), len(data) & 0xFFFFFFFF)
-    return GZIP_START + deflate.deflate_compress(data, LEVEL) + check
+    trailer = struct.pack("<2I", zlib.crc32(data), len(data) & 0xFFFFFFFF)
+    return GZIP_START + deflate.deflate_compress(data, LEVEL) + trailer
 
 
 def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
@@ -383,7 +385,9 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     header = SpzHeader.parse(path, start)
     if header.version > 3:
         raise DataError(f"{path}: SPZ version 4 must use Zstandard, not gzip; export it again")
-    _check_size(path, header, len(data) if data[:4] == MAGIC else min(len(data) * CODE_RATIO, _max_decoded_size(data)))
+    _check_size(
+        path, header, len(data) if data[:4] == MAGIC else min(len(data) * DEFLATE_RATIO, _max_decoded_size(data))
+    )
 
     def read(size: int) -> bytes:
         if len(part := stream.read(size)) < size:

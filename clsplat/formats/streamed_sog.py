@@ -27,10 +27,10 @@ from clsplat.formats.splats import (
     SplatFile,
     WriteOptions,
     concatenate,
+    normalize_quats,
     require_gaussians,
     require_in_range,
     typical_size,
-    unit,
 )
 
 LOD_META = "lod-meta.json"
@@ -47,13 +47,13 @@ def looks_like_lod(data: bytes) -> bool:
 def read_lod(path: Path) -> SplatFile:
     """Read the finest level of a lod-meta.json and its environment.  Raises DataError if it is damaged."""
     meta = _read_meta(path)
-    runs = _row_ranges(path, meta)[0]
-    if not runs:
+    ranges = _row_ranges(path, meta)[0]
+    if not ranges:
         raise DataError(f"{path}: its leaves have no file of level 0; export it again")
-    count = sum(count for leaves in runs.values() for _, count in leaves)
+    count = sum(count for leaves in ranges.values() for _, count in leaves)
     require_plausible(path, count, sum(file.stat().st_size for file in lod_files(path) if file.is_file()))
-    parts = [_read_splats(path, meta["filenames"][file], runs[file]) for file in sorted(runs)]
-    _require_count(path, meta, 0, runs)
+    parts = [_read_splats(path, meta["filenames"][file], ranges[file]) for file in sorted(ranges)]
+    _require_count(path, meta, 0, ranges)
     if "environment" in meta:
         parts.append(read_sog(path.parent / _check_name(path, meta["environment"])))
     return SplatFile(concatenate([part.parameters for part in parts]), parts[0].rendering, parts[0].mode)
@@ -64,19 +64,19 @@ def find_level_faults(path: Path) -> list[str]:
     meta, faults = _read_meta(path), []
     levels = _row_ranges(path, meta)
     unused_files: RangesByFile = {file: [] for file in {*range(len(meta["filenames"]))}.difference(*levels)}
-    for level, runs in enumerate(levels):
+    for level, ranges in enumerate(levels):
         try:
-            faults += _find_faults(path, meta, runs) if level else []
-            _require_count(path, meta, level, runs)
+            faults += _find_faults(path, meta, ranges) if level else []
+            _require_count(path, meta, level, ranges)
         except DataError as error:
             faults.append(str(error))
     return faults + _find_faults(path, meta, unused_files)
 
 
-def _find_faults(path: Path, meta: dict[str, Any], runs: RangesByFile) -> list[str]:
-    """Return an error message for each missing or damaged file.  runs: row ranges of leaves, by file number."""
+def _find_faults(path: Path, meta: dict[str, Any], ranges: RangesByFile) -> list[str]:
+    """Return an error message for each missing or damaged file.  ranges: row ranges of leaves, by file number."""
     faults = []
-    for file, leaves in sorted(runs.items()):
+    for file, leaves in sorted(ranges.items()):
         try:
             _read_splats(path, meta["filenames"][file], leaves)
         except DataError as error:
@@ -128,29 +128,29 @@ def _row_ranges(path: Path, meta: dict[str, Any]) -> list[RangesByFile]:
     """Return the row ranges of the leaves in each file, for each level.  Raises DataError for a damaged leaf."""
     levels: list[RangesByFile] = [{} for _ in meta["counts"]]
     level_by_name = {str(level): level for level in range(len(levels))}
-    for leaf in _leaves(path, meta.get("tree")):
-        for name, run in leaf.items():
+    for leaf in _iterate_leaves(path, meta.get("tree")):
+        for name, entry in leaf.items():
             if name not in level_by_name:
                 raise DataError(
                     f"{path}: a leaf refers to level {quote(name)}; expected 0 to {len(levels) - 1}; export it again"
                 )
-            file, offset, count = (_parse_integer(path, key, run) for key in ("file", "offset", "count"))
+            file, offset, count = (_parse_integer(path, key, entry) for key in ("file", "offset", "count"))
             levels[level_by_name[name]].setdefault(file, []).append((offset, count))
-    for level, runs in enumerate(levels):
-        if max(runs, default=-1) >= len(meta["filenames"]):
+    for level, ranges in enumerate(levels):
+        if max(ranges, default=-1) >= len(meta["filenames"]):
             raise DataError(f"{path}: a leaf refers to a missing file of level {level}; export it again")
-    return [{file: sorted(leaves) for file, leaves in runs.items()} for runs in levels]
+    return [{file: sorted(leaves) for file, leaves in ranges.items()} for ranges in levels]
 
 
-def _require_count(path: Path, meta: dict[str, Any], level: int, runs: RangesByFile) -> None:
-    count, expected = sum(count for leaves in runs.values() for _, count in leaves), meta["counts"][level]
+def _require_count(path: Path, meta: dict[str, Any], level: int, ranges: RangesByFile) -> None:
+    count, expected = sum(count for leaves in ranges.values() for _, count in leaves), meta["counts"][level]
     if count != expected:
         raise DataError(
             f"{path}: declares {quote(expected)} splats of level {level}, but its leaves have {count}; export it again"
         )
 
 
-def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
+def _iterate_leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
     """Yield the row ranges of each leaf, by level."""
     pending = [tree]
     while pending:
@@ -164,18 +164,18 @@ def _leaves(path: Path, tree: Any) -> Iterator[dict[str, Any]]:
             raise DataError(f"{path}: a node of its tree is {quote(node)}; expected children or lods; export it again")
 
 
-def _parse_integer(path: Path, key: str, run: Any) -> int:
-    value = run.get(key) if isinstance(run, dict) else None
+def _parse_integer(path: Path, key: str, entry: Any) -> int:
+    value = entry.get(key) if isinstance(entry, dict) else None
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise DataError(f"{path}: {key} of a leaf is {quote(value)}; expected a whole number; export it again")
     return value
 
 
-def _read_splats(path: Path, name: str, runs: list[RowRange]) -> SplatFile:
-    """Return the splats of a file that belong to leaves.  runs: row ranges in ascending order."""
+def _read_splats(path: Path, name: str, ranges: list[RowRange]) -> SplatFile:
+    """Return the splats of a file that belong to leaves.  ranges: row ranges in ascending order."""
     splats = read_sog(path.parent / name)
     rows, end = [np.arange(0)], 0
-    for offset, count in runs:
+    for offset, count in ranges:
         if offset < end or offset + count > len(splats):
             raise DataError(
                 f"{path}: a leaf contains splats {offset} to {offset + count - 1} of {quote(name)}; expected splats "
@@ -246,7 +246,7 @@ def half_boxes(level: Parameters) -> Floats:
     """Return half the side lengths of the bounding boxes of Gaussians at one sigma, [N, 3] scene units."""
     from scipy.spatial.transform import Rotation
 
-    axes = np.abs(Rotation.from_quat(np.roll(unit(level["quats"]), -1, axis=1)).as_matrix())
+    axes = np.abs(Rotation.from_quat(np.roll(normalize_quats(level["quats"]), -1, axis=1)).as_matrix())
     scales = np.exp(np.minimum(level["log_scales"].astype(np.float64), MAX_LOG_SCALE))
     half: Floats = np.einsum("nij,nj->ni", axes, scales)
     return half
@@ -292,7 +292,7 @@ class _FileList:
     """The files of all levels.  Leaves are added to a file until it has more than `splats` splats."""
 
     splats: int
-    rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: the level, and runs of its rows
+    rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: level, rows of each leaf
     next_file: dict[int, int] = field(default_factory=dict)  # by level, the number of the file for the next leaf
 
     def to_json(self, node: Node) -> dict[str, Any]:
@@ -300,15 +300,15 @@ class _FileList:
         bound = {"bound": {"min": _round(node.low), "max": _round(node.high)}}
         if node.children:
             return {**bound, "children": [self.to_json(child) for child in node.children]}
-        lods = {str(level): self._run(level, rows) for level, rows in enumerate(node.rows) if len(rows)}
+        lods = {str(level): self._add_rows(level, rows) for level, rows in enumerate(node.rows) if len(rows)}
         return {**bound, "lods": lods}
 
-    def _run(self, level: int, rows: Rows) -> dict[str, int]:
+    def _add_rows(self, level: int, rows: Rows) -> dict[str, int]:
         number = self.next_file.setdefault(level, 0)
         name = f"{level}_{number}/{META}"
-        runs = self.rows.setdefault(name, (level, []))[1]
-        offset = sum(map(len, runs))
-        runs.append(rows)
+        parts = self.rows.setdefault(name, (level, []))[1]
+        offset = sum(map(len, parts))
+        parts.append(rows)
         if offset + len(rows) > self.splats:
             self.next_file[level] += 1
         return {"file": list(self.rows).index(name), "offset": offset, "count": len(rows)}

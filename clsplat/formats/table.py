@@ -35,14 +35,14 @@ from clsplat.formats.streamed_sog import LOD_META, lod_files, looks_like_lod, re
 
 
 @dataclass(frozen=True)
-class Start:
-    """The first bytes of a file."""
+class FileStart:
+    """The first bytes of a file, by which its format is detected."""
 
     path: Path
     data: bytes  # at most MAX_HEADER bytes
     size: int  # bytes of the file
 
-    def ply(self) -> PlyHeader | None:
+    def parse_ply(self) -> PlyHeader | None:
         """Return the header of a readable PLY file, or None for other files."""
         if not self.data.startswith(b"ply"):
             return None
@@ -58,7 +58,7 @@ class Codec:
 
     name: str
     endings: tuple[str, ...]  # of file names
-    matches: Callable[[Start], bool]
+    matches: Callable[[FileStart], bool]
     read: Callable[[Path, ReadOptions], SplatFile] | None = None
     write: Callable[[Path, SplatFile, WriteOptions], str] | None = None  # returns the SHA-256
     command: str = ""  # the only command that writes this format
@@ -103,7 +103,7 @@ CODECS = (
     Codec(
         "PLY",
         (".ply",),
-        lambda start: (header := start.ply()) is not None and "f_dc_0" in (header.dtype.names or ()),
+        lambda start: (header := start.parse_ply()) is not None and "f_dc_0" in (header.dtype.names or ()),
         lambda path, options: read_ply(path),
         lambda path, splats, options: write_ply(path, splats.parameters, splats.rendering),
         keeps_all=True,
@@ -112,7 +112,7 @@ CODECS = (
     Codec(
         "compressed PLY",
         (".compressed.ply",),
-        lambda start: (header := start.ply()) is not None and is_compressed(header),
+        lambda start: (header := start.parse_ply()) is not None and is_compressed(header),
         lambda path, options: read_compressed_ply(path),
         keeps_rendering=True,
     ),
@@ -193,7 +193,7 @@ def detect(path: Path) -> Codec | None:
     Raises DataError if the file cannot be read, is empty, or is a failed download.
     """
     with open_file(path, "a model file") as file:
-        start = Start(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
+        start = FileStart(path, file.read(MAX_HEADER), file.seek(0, os.SEEK_END))
     named_codec = format_from_name(path)
     codec = next((c for c in CODECS if c.matches(start) and (c.has_magic or named_codec in (None, c))), None)
     if codec is None or not start.size:
@@ -213,7 +213,7 @@ def read(path: Path, options: ReadOptions | None = None) -> SplatFile:
     """Read a model file of any format.  Raises DataError if it is missing, damaged, or of an unknown format."""
     options = options or ReadOptions()
     path = model_file(path)
-    codec = detect(path) or format_from_name(path)  # the reader of the named format reports what is wrong
+    codec = detect(path) or format_from_name(path)  # the reader for that file name reports what is wrong
     if codec is None:
         known_endings = ", ".join(endings(reads=True))
         raise DataError(f"{path}: unknown model format; expected one of {known_endings}")
@@ -288,7 +288,8 @@ FACTOR = 10  # a near plane within this factor of the default needs no warning
 def _unusual_settings(splats: SplatFile) -> str:
     """Describe the rendering settings that differ from the defaults for files without them."""
     near, default = splats.rendering.get("near"), default_near(splats.parameters["means"])
-    usual: dict[str, Any] = {} if near and default / FACTOR < near < default * FACTOR else {"near": near and default}
-    usual |= {"screen_variance": MIP_VARIANCE if splats.mode == "mip" else VARIANCE, "background": None, "pixel_box": 0}
-    values = {name: splats.rendering.get(name, value) for name, value in usual.items()}
-    return ", ".join(f"{name} = {value}" for name, value in values.items() if value != usual[name])
+    defaults: dict[str, Any] = {} if near and default / FACTOR < near < default * FACTOR else {"near": near and default}
+    variance = MIP_VARIANCE if splats.mode == "mip" else VARIANCE
+    defaults |= {"screen_variance": variance, "background": None, "pixel_box": 0}
+    values = {name: splats.rendering.get(name, value) for name, value in defaults.items()}
+    return ", ".join(f"{name} = {value}" for name, value in values.items() if value != defaults[name])

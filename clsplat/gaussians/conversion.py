@@ -28,12 +28,12 @@ from clsplat.formats.splats import (
     ReadOptions,
     WriteOptions,
     is_timestamp,
+    normalize_quats,
     sh_coefficients,
-    unit,
     with_degree,
 )
 from clsplat.formats.table import format_from_name, model_bytes, writing_format
-from clsplat.gaussians.model import Model, exported_model, load, model_path
+from clsplat.gaussians.model import Model, exported_model_path, load, model_path
 from clsplat.gaussians.motion import static_motion, with_motion
 from clsplat.gaussians.sky import sample_texels, sky_path
 from clsplat.scene.scene import PointCloud
@@ -122,7 +122,7 @@ class Changes:
         return result
 
 
-SOLID = 0.5  # opacity of the Gaussians that may be ground
+SOLID = 0.5  # smallest opacity of the Gaussians that may be ground
 
 
 def solid_means(model: Model) -> NDArray[np.float32]:
@@ -156,14 +156,14 @@ def without_floaters(model: Model) -> Model:
     """Return a model without floaters, and log their number.  Sky Gaussians are kept.
 
     Floaters are large and faint compared with their neighbors, belong to small groups that touch nothing else, or are
-    far outside.  Raises ConfigError for a moving model, and DataError if these are many of the Gaussians.
+    far from the scene.  Raises ConfigError for a moving model, and DataError if too many Gaussians would be floaters.
     """
     if model.motion is not None:
         raise ConfigError("--filter-floaters needs a static model; add --time T")
     rows = np.flatnonzero(model.is_scene)
     if len(rows) <= NEIGHBORS:
         return model
-    is_faint, is_isolated, is_outside = _floaters(model[rows])
+    is_faint, is_isolated, is_outside = _find_floaters(model[rows])
     is_floater = is_faint | is_isolated | is_outside
     if is_floater.mean() > MAX_FLOATERS:
         raise DataError(
@@ -171,7 +171,7 @@ def without_floaters(model: Model) -> Model:
             "omit --filter-floaters"
         )
     LOG.info(
-        "removed %s of %s Gaussians as floaters: %s large and faint, %s isolated, %s far outside",
+        "removed %s of %s Gaussians as floaters: %s large and faint, %s isolated, %s far from the scene",
         *(
             f"{count:,}"
             for count in (is_floater.sum(), len(model), is_faint.sum(), is_isolated.sum(), is_outside.sum())
@@ -182,8 +182,8 @@ def without_floaters(model: Model) -> Model:
     return model[is_kept]
 
 
-def _floaters(model: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return masks, [N], of Gaussians that are large and faint, of other isolated ones, and of others far outside."""
+def _find_floaters(model: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return disjoint masks, [N], of Gaussians that are large and faint, isolated, or far from the scene."""
     means, scales = model.means.astype(np.float64), model.scales.astype(np.float64)
     center_distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
     is_outside = center_distances > OUTSIDE * np.quantile(center_distances, 0.99)
@@ -191,7 +191,7 @@ def _floaters(model: Model) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArr
     distances, neighbors = distances[:, 1:], neighbors[:, 1:]
     size = scales.max(axis=1)
     is_faint = (size > LARGE * np.median(size[neighbors], axis=1)) & (model.opacities < FAINT)
-    axes = rotation_matrix(*unit(model.quats).T) * scales[:, None]
+    axes = rotation_matrix(*normalize_quats(model.quats).T) * scales[:, None]
     pairs = []
     for distance, neighbor in zip(distances.T, neighbors.T, strict=True):
         direction = (means[neighbor] - means) / np.maximum(distance, 1e-300)[:, None]
@@ -234,7 +234,7 @@ def convert(
 
 def read(sources: Sequence[Path]) -> Model:
     """Read and merge model files or run folders, without Gaussians that are not finite.  Raises DataError."""
-    models = [load(exported_model(source), ReadOptions(not_finite="drop")) for source in sources]
+    models = [load(exported_model_path(source), ReadOptions(not_finite="drop")) for source in sources]
     return merge_models(models, [str(source) for source in sources])
 
 

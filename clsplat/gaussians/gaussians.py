@@ -21,13 +21,13 @@ from clsplat.core.errors import ConfigError
 from clsplat.formats.splats import MOTION, PARAMETERS, columns_to_sh_degree, sh_coefficients
 from clsplat.gaussians.sh_offload import HostTables, slot_defines
 from clsplat.gaussians.sky import DeviceSky
-from clsplat.gaussians.structs import HARMONICS, DeferredUpdates, Struct, check_rows, moment_tables
+from clsplat.gaussians.structs import HARMONICS, DeferredUpdates, GaussianTables, check_rows, moment_tables
 from clsplat.opencl.device import Array, Device
 
 # Detection of NaN and infinity.
 
 
-def find_nonfinite(gaussians: Struct) -> list[str]:
+def find_nonfinite(gaussians: GaussianTables) -> list[str]:
     """Return the names of parameters that contain NaN or infinity, in their values or in their Adam moments."""
     device, names = gaussians.device, set()
     counters = {name: device.zeros(1, np.uint32) for name in gaussians.trained}

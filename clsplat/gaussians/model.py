@@ -89,16 +89,16 @@ MODEL = "point_cloud.ply"  # default in a run folder
 def model_path(path: Path) -> Path:
     """Return the model file of a path: its meta.json for a SOG folder, and its model for a run folder."""
     file = model_file(path)
-    return run_model(file) if file.is_dir() else file
+    return run_model_path(file) if file.is_dir() else file
 
 
-def run_model(folder: Path) -> Path:
+def run_model_path(folder: Path) -> Path:
     """Return the model file of a run folder: the last export, preferably the one without sky Gaussians."""
-    file = exported_model(folder)
+    file = exported_model_path(folder)
     return scene_file if (scene_file := without_sky_path(file)).is_file() else file
 
 
-def exported_model(path: Path) -> Path:
+def exported_model_path(path: Path) -> Path:
     """Return the last export of a run folder, as named in its metrics.json; return other paths unchanged."""
     return run_output(path, "export", MODEL) if model_file(path).is_dir() else path
 
@@ -112,7 +112,7 @@ def run_output(folder: Path, stage: str, default: str) -> Path:
     return folder / (name if isinstance(name, str) and is_inside(name) else default)
 
 
-def raw_model(file: Path) -> Path:
+def raw_model_path(file: Path) -> Path:
     """Return the PLY next to a run's model that stores the world filter separately, or the model if there is none."""
     raw_path = file.with_name(f"{file.stem.removesuffix(WITHOUT_SKY)}_raw.ply")
     return raw_path if raw_path.is_file() else file

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.gaussians.structs import Struct
+from clsplat.gaussians.structs import GaussianTables
 from clsplat.opencl.device import Array
 
 NO_SLOT = 0xFFFFFFFF  # slots.h
@@ -22,7 +22,7 @@ MIN_ROWS = 4096  # rows in all slots; also the rows per upload when all blocks a
 class HostTables:
     """Tables of Gaussians in host memory, each [blocks, components, LANES]; a block has LANES rows."""
 
-    def __init__(self, gaussians: Struct) -> None:
+    def __init__(self, gaussians: GaussianTables) -> None:
         """gaussians: the Gaussians whose SH tables are offloaded; slots replace these tables in `gaussians.tables`."""
         self.gaussians, self.device = gaussians, gaussians.device
         self.lanes = int(self.device.tuning["LANES"])
@@ -135,13 +135,13 @@ class HostTables:
         self.loaded_blocks, self.slot = np.zeros(0, np.int64), self._no_slots()
 
 
-def slot_arguments(gaussians: Struct) -> dict[str, Any]:
+def slot_arguments(gaussians: GaussianTables) -> dict[str, Any]:
     """Return the kernel arguments that locate the SH (cl_kernels/slots.h)."""
     if gaussians.on_host:
         return {"sh_slot": gaussians.on_host.slot, "sh_block": gaussians.on_host.block_size}
     return {"sh_slot": gaussians.no_slot, "sh_block": 0}
 
 
-def slot_defines(gaussians: Struct) -> dict[str, int]:
+def slot_defines(gaussians: GaussianTables) -> dict[str, int]:
     """Return the macros of kernels that read SH from slots."""
     return {"SH_SLOTS": 1} if gaussians.on_host else {}

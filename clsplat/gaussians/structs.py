@@ -30,7 +30,7 @@ class DeferredUpdates(Protocol):
         """Record an update that has already been applied to visible rows."""
 
 
-class Struct(Protocol):
+class GaussianTables(Protocol):
     """The part of `Gaussians` that its helpers use."""
 
     device: Device
@@ -59,7 +59,7 @@ class Struct(Protocol):
 class GaussianGradients:
     """Gradients of the loss with respect to each parameter, with the shapes of the parameters."""
 
-    def __init__(self, gaussians: Struct) -> None:
+    def __init__(self, gaussians: GaussianTables) -> None:
         self.arrays = {name: gaussians.device.zeros(shape) for name, shape in _shapes(gaussians).items()}
         self._withheld_names: tuple[str, ...] = ()
         self.mean2d = gaussians.device.zeros((2, gaussians.capacity))  # px⁻¹, for densification statistics
@@ -84,7 +84,7 @@ class GaussianGradients:
         gradients.arrays = arrays
         return gradients
 
-    def fits(self, gaussians: Struct) -> bool:
+    def fits(self, gaussians: GaussianTables) -> bool:
         """Return whether the gradients have the shapes of these Gaussians' parameters."""
         return {name: array.shape for name, array in self.arrays.items()} == _shapes(gaussians)
 
@@ -93,7 +93,7 @@ class GaussianGradients:
         return {**{f"grad_{name}": self.arrays[name] for name in PARAMETERS}, "grad_mean2d": self.mean2d}
 
 
-def _shapes(gaussians: Struct) -> dict[str, tuple[int, ...]]:
+def _shapes(gaussians: GaussianTables) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the trained tables, by name.  For tables in host memory, return the shape of their slots."""
     return {name: gaussians.tables[name].array.shape for name in gaussians.trained}
 

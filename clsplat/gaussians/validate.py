@@ -114,7 +114,7 @@ def verdict(report: dict[str, Any]) -> str:
 
 
 def _find_activated(model: Model) -> list[str]:
-    """Return findings about values to which the activation function seems to have been applied already."""
+    """Return findings about values that seem to be stored after activation, such as scales instead of logarithms."""
     if len(model) < MIN_COUNT:
         return []
     findings = []

@@ -21,7 +21,7 @@ from clsplat.core.files import METRICS, PIPELINE, open_atomic, path_exists, rais
 from clsplat.core.progress import counted
 from clsplat.core.reading import read_json
 from clsplat.formats.table import model_file
-from clsplat.gaussians.model import MODEL, Model, load, model_path, run_model
+from clsplat.gaussians.model import MODEL, Model, load, model_path, run_model_path
 from clsplat.metrics.perceptual import Perceptual
 from clsplat.metrics.views import PSNR_AND_SSIM, mean, measure
 from clsplat.nerf.files import FieldModel, find_field, is_field, load_field
@@ -160,7 +160,7 @@ def _missing_model_error(folder: Path, name: str = MODEL) -> DataError:
 
 def refuse_field(path: Path) -> None:
     """Raise DataError for a field file, and for a run that trained a field."""
-    if is_field(path) or (has_pipeline(path) and _has_field(path) and not run_model(path).is_file()):
+    if is_field(path) or (has_pipeline(path) and _has_field(path) and not run_model_path(path).is_file()):
         raise field_error(path)
 
 
@@ -172,7 +172,7 @@ def field_error(path: Path) -> DataError:
 
 def trained_file(run: Path) -> Path:
     """Return the model file that a run trained: Gaussians, or a field."""
-    file = run_model(run)
+    file = run_model_path(run)
     return file if file.is_file() or not _has_field(run) else find_field(run)
 
 

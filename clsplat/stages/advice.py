@@ -114,7 +114,8 @@ def advise_on_capture(train: Sequence[View], views: Sequence[View], rerun: str) 
         yield f"only {count}; show every part of the scene in at least five, from several sides, then `{rerun}`"
     if gap := find_widest_gap(views):
         degrees, first, second = gap
-        yield f"no photo was taken in the {degrees:.0f}° between {first} and {second}; take photos there, then `{rerun}`"
+        arc = f"{degrees:.0f}° between {first} and {second}"
+        yield f"no photo was taken in the {arc}; take photos there, then `{rerun}`"
 
 
 def find_outliers(psnr: Mapping[str, float]) -> list[str]:

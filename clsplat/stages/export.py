@@ -70,14 +70,14 @@ class Export(Scheduled):
         if model.filter_variance is not None:
             files[raw_path] = model
         options = WriteOptions(quality=self.quality)
-        for file, exported_model in files.items():
-            run.model_hashes[_name(file, run)] = exported_model.save(file, options)
+        for file, exported_model_path in files.items():
+            run.model_hashes[_name(file, run)] = exported_model_path.save(file, options)
             try:
                 if writing_format(file).read:
                     load(file, ReadOptions(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; the file was just written: check the disk and its free space") from error
-            LOG.debug("%s written to %s", size_text(len(model), None, len(exported_model) - len(model)), file)
+            LOG.debug("%s written to %s", size_text(len(model), None, len(exported_model_path) - len(model)), file)
         run.model_hashes.pop(_name(sky_path, run), None)
         if sky_path.is_file():
             run.model_hashes[_name(sky_path, run)] = sha256(sky_path)

@@ -31,7 +31,7 @@ from clsplat.core.text_table import text_table
 from clsplat.formats.ply import join_plys
 from clsplat.formats.table import detect
 from clsplat.gaussians.conversion import from_points
-from clsplat.gaussians.model import DEFAULT_RENDERING, Model, model_path, raw_model
+from clsplat.gaussians.model import DEFAULT_RENDERING, Model, model_path, raw_model_path
 from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device
 from clsplat.photos.photographs import Photographs
@@ -161,7 +161,7 @@ class Blocks:
         file = self.coarse_file
         if file is None and self.coarse is not None:
             LOG.info("training the coarse model")
-            file = raw_model(train_in_folder(self.coarse, self.out / COARSE, self.device))
+            file = raw_model_path(train_in_folder(self.coarse, self.out / COARSE, self.device))
         assert file is not None
         scene, background = self.run_scene.scene, self.run_scene.background
         model = load_model(file).in_scene(scene)
@@ -201,7 +201,7 @@ class Blocks:
             with failures.recording(block.name):
                 try:
                     model = train_in_folder(pipelines[block.name], self.out / block.name, self.device)
-                    files.append((block, raw_model(model)))
+                    files.append((block, raw_model_path(model)))
                 except EmptyRegionError:
                     LOG.warning("%s: no Gaussians are left in its cell; continuing without it", block.name)
         if failures:
@@ -278,7 +278,7 @@ def _coarse_file(coarse: str) -> Path | None:
     path = Path(coarse)
     if path.is_dir() or (path.is_file() and detect(path)):
         require_model(path)
-        return raw_model(model_path(path))
+        return raw_model_path(model_path(path))
     return None
 
 

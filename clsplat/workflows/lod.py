@@ -15,7 +15,7 @@ from clsplat.core.files import new_folder, require_free
 from clsplat.core.reading import sha256
 from clsplat.core.text_table import text_table
 from clsplat.density.mixture import Floats, Mixtures, Rows, masses, merge, surface, to_log_scales
-from clsplat.formats.splats import not_finite, require_in_range, require_static, unit
+from clsplat.formats.splats import normalize_quats, not_finite, require_in_range, require_static
 from clsplat.formats.streamed_sog import LOD_META, write_lod
 from clsplat.formats.table import model_bytes, model_file
 from clsplat.gaussians.model import Model, load
@@ -185,7 +185,7 @@ def _find_neighbors(means: Floats) -> tuple[Rows, Rows]:
 def _clipped_tables(model: Model) -> Tables:
     """Return float64 tables with unit quaternions, and values clipped so that no derived value overflows."""
     tables = {name: table.astype(np.float64) for name, table in model.tables().items()}
-    tables["quats"] = unit(tables["quats"])
+    tables["quats"] = normalize_quats(tables["quats"])
     tables["log_scales"] = np.clip(tables["log_scales"], *LOG_SCALES)
     tables["logit_opacity"] = np.clip(tables["logit_opacity"], -LOGIT, LOGIT)
     return tables

@@ -32,7 +32,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/training/archive.py:write": "writes",
     "clsplat/core/lock.py:check_free": "locks what it opens",
     "clsplat/core/lock.py:_open_lock_file": "opens for writing too",
-    "clsplat/formats/sog.py:sog_files": "takes the bytes that `reading` has read",
+    "clsplat/formats/sog.py:open_sog": "takes the bytes that `reading` has read",
     "clsplat/formats/sog.py:_zip": "writes",
     "clsplat/viewer/video/encoding.py:open_video": "syncs what it has written",
     "clsplat/viewer/video/encoding.py:count_frames": "decodes what was written before",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.formats.splats import SH_C0, SplatFile, flip_axes, opacities, unit
+from clsplat.formats.splats import SH_C0, SplatFile, flip_axes, normalize_quats, opacities
 from clsplat.formats.table import read
 from tests.support.data_sets import data_set
 
@@ -142,7 +142,7 @@ def test_values_are_those_of_the_golden_files():
             "positions": p["means"],
             "scales": np.exp(p["log_scales"]),
             "opacities": opacities(p["logit_opacity"]),
-            "orientations": unit(p["quats"]),
+            "orientations": normalize_quats(p["quats"]),
             "sphericalHarmonicsCoefficients": harmonics,
         }
         for name, table in values.items():

@@ -13,7 +13,7 @@ from clsplat.core.errors import DataError
 from clsplat.core.harmonics import basis
 from clsplat.core.reading import sha256
 from clsplat.formats.gltf_usd import write_glb
-from clsplat.formats.splats import SH_C0, WriteOptions, flip_axes, opacities, unit
+from clsplat.formats.splats import SH_C0, WriteOptions, flip_axes, normalize_quats, opacities
 from clsplat.formats.table import detect, model_files, read, write
 from clsplat.gaussians.model import Model, load
 from tests.support.models import angles, assert_close, interop, join_glb, round_trip, splats, split_glb, spz_tree
@@ -57,7 +57,7 @@ def test_glb_follows_the_specification(tmp_path, rng):
     np.testing.assert_array_equal(values, source.parameters["means"] * np.float32([1, -1, -1]))
     rotation = attribute(tree, binary, f"{KHR}:ROTATION")
     np.testing.assert_allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-6)
-    w, x, y, z = unit(source.parameters["quats"]).T
+    w, x, y, z = normalize_quats(source.parameters["quats"]).T
     np.testing.assert_allclose(rotation, np.stack([x, -y, -z, w], axis=1), atol=1e-6)
     np.testing.assert_allclose(
         attribute(tree, binary, f"{KHR}:SCALE"), np.exp(source.parameters["log_scales"]), rtol=1e-6
@@ -82,7 +82,7 @@ def test_glb_of_another_program_equals_its_source():
 
 def covariances(model):
     """Of each Gaussian, [N, 3, 3]: several quaternions, by half turns about its own axes, give the same."""
-    axes = Rotation.from_quat(np.roll(unit(model.quats), -1, axis=1)).as_matrix() * model.scales[:, None, :]
+    axes = Rotation.from_quat(np.roll(normalize_quats(model.quats), -1, axis=1)).as_matrix() * model.scales[:, None, :]
     return axes @ axes.transpose(0, 2, 1)
 
 
@@ -103,7 +103,9 @@ def test_moved_turned_and_scaled_node_moves_its_gaussians(tmp_path, rng):
     for name, table in expected.tables().items():
         if name != "quats":
             np.testing.assert_allclose(getattr(pipeline, name), table, atol=2e-6, err_msg=name)
-    np.testing.assert_allclose(np.abs((unit(pipeline.quats) * unit(expected.quats)).sum(axis=1)), 1, atol=1e-6)
+    np.testing.assert_allclose(
+        np.abs((normalize_quats(pipeline.quats) * normalize_quats(expected.quats)).sum(axis=1)), 1, atol=1e-6
+    )
 
 
 def test_low_precision_rotation_is_accepted(tmp_path, rng):
@@ -268,7 +270,7 @@ def test_openusd_holds_every_number(tmp_path, rng):
     np.testing.assert_array_equal(tables["positions"], p["means"] * np.float32([1, -1, -1]))
     np.testing.assert_allclose(tables["scales"], np.exp(p["log_scales"]), rtol=1e-6)
     np.testing.assert_allclose(tables["opacities"], opacities(p["logit_opacity"])[:, 0], rtol=1e-6)
-    np.testing.assert_allclose(tables["orientations"], unit(p["quats"]) * [1, 1, -1, -1], atol=1e-6)
+    np.testing.assert_allclose(tables["orientations"], normalize_quats(p["quats"]) * [1, 1, -1, -1], atol=1e-6)
     harmonics = tables["radiance:sphericalHarmonicsCoefficients"].reshape(700, 4, 3)
     np.testing.assert_array_equal(harmonics[:, 0], p["sh_base"])
     np.testing.assert_array_equal(harmonics[:, 1:], p["sh_rest"].reshape(700, 3, 3) * np.float32([[-1], [-1], [1]]))
@@ -383,7 +385,7 @@ def test_linear_colors_become_srgb(tmp_path, rng, caplog):
     back = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(back, linear, atol=1e-5)
     assert not actual["sh_rest"][:40].any()
-    directions = unit(rng.normal(size=(50, 4)))[:, :3]
+    directions = normalize_quats(rng.normal(size=(50, 4)))[:, :3]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
 
     def colors(base, rest):

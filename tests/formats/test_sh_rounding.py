@@ -14,15 +14,15 @@ from clsplat.formats.sog_quantize import (
     MAX_LOG_WEIGHT,
     SH_LEVELS,
     compensate_base,
+    fit_tree_palette,
     is_before_gap,
     log_weights,
     quantization_steps,
     round_sh,
     scaled_step,
-    tree_palette,
     visible_form,
 )
-from clsplat.formats.splats import SH_C0, SplatFile, WriteOptions, unit
+from clsplat.formats.splats import SH_C0, SplatFile, WriteOptions, normalize_quats
 from clsplat.formats.table import read, write
 from clsplat.gaussians.conversion import with_sky_splats
 from clsplat.gaussians.model import Model, load
@@ -49,7 +49,7 @@ def visible_error(error: np.ndarray, form: np.ndarray) -> np.ndarray:
 
 def covariances(one: SplatFile) -> np.ndarray:
     """Of each Gaussian, [N, 3, 3]."""
-    w, x, y, z = unit(one.parameters["quats"]).T
+    w, x, y, z = normalize_quats(one.parameters["quats"]).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -96,7 +96,9 @@ def test_model_without_sky_counts_all_gaussians(rng, tmp_path):
     """Most Gaussians in a small object, the others far around it: no sky, where the file notes none."""
     source = splats(rng, 2300, 0)
     directions, radii = rng.normal(size=(2300, 3)), np.append(rng.uniform(0, 0.1, 2000), rng.uniform(2, 3, 300))
-    source.parameters["means"] = unit(np.pad(directions, ((0, 0), (1, 0))))[:, 1:] * radii[:, None].astype(np.float32)
+    source.parameters["means"] = normalize_quats(np.pad(directions, ((0, 0), (1, 0))))[:, 1:] * radii[:, None].astype(
+        np.float32
+    )
     source.parameters["means"] = source.parameters["means"].astype(np.float32)
     assert not is_before_gap(radii).all()
     assert abs(np.median(log_weights(source.parameters))) < 1e-9
@@ -255,7 +257,9 @@ def test_spz_positions_and_rotations_are_within_their_steps(tmp_path, rng):
     largest = smallest / 4 * np.exp2(-log_weights(expected.parameters)[:, None] / 2)  # half a step
     assert (away <= np.maximum(largest, 2**-13) * 1.0001).all()
     assert (away > smallest / 4).any(), "where weights are small, steps are larger"
-    cosine = np.abs((unit(copy.parameters["quats"]) * unit(expected.parameters["quats"])).sum(axis=1))
+    cosine = np.abs(
+        (normalize_quats(copy.parameters["quats"]) * normalize_quats(expected.parameters["quats"])).sum(axis=1)
+    )
     assert np.degrees(2 * np.arccos(np.minimum(cosine, 1))).max() < 0.7
 
 
@@ -269,7 +273,7 @@ def test_spz_gzip_is_readable_by_other_programs(tmp_path, rng):
 def test_neighbor_palette_holds_the_means_of_its_clusters(count, entries, rng):
     rest = one_sided_model(rng, count).parameters["sh_rest"]
     weights = rng.normal(size=count)
-    vectors, labels = tree_palette(rest, weights, entries, 1.0)
+    vectors, labels = fit_tree_palette(rest, weights, entries, 1.0)
     assert len(vectors) <= entries
     np.testing.assert_array_equal(np.unique(labels), np.arange(len(vectors)))
     sums = np.zeros((len(vectors), 45))
@@ -278,17 +282,17 @@ def test_neighbor_palette_holds_the_means_of_its_clusters(count, entries, rng):
     np.testing.assert_allclose(np.rint(vectors * SH_LEVELS), vectors * SH_LEVELS)
     assert np.abs(vectors - means).mean() < 16 / SH_LEVELS
     for _ in range(2):
-        np.testing.assert_array_equal(tree_palette(rest, weights, entries, 1.0)[1], labels)
+        np.testing.assert_array_equal(fit_tree_palette(rest, weights, entries, 1.0)[1], labels)
 
 
 def test_neighbor_palette_favors_heavier_gaussians(rng):
     rest = one_sided_model(rng, 2000).parameters["sh_rest"]
     weights = np.where(np.arange(2000) % 4 == 0, 3.0, -3.0)
-    vectors, labels = tree_palette(rest, weights, 400, 2.0)
+    vectors, labels = fit_tree_palette(rest, weights, 400, 2.0)
     errors = visible_error(vectors[labels] - rest, visible_form(rest))
     assert errors[::4].mean() < 0.3 * errors[weights < 0].mean()
     same = np.tile(rest[:1], (50, 1))
-    vectors, labels = tree_palette(same, np.zeros(50), 20, 1.0)
+    vectors, labels = fit_tree_palette(same, np.zeros(50), 20, 1.0)
     assert len(vectors) == 1
     assert not labels.any()
 
@@ -296,7 +300,7 @@ def test_neighbor_palette_favors_heavier_gaussians(rng):
 def test_existing_palette_is_recovered(rng):
     few = one_sided_model(rng, 300).parameters["sh_rest"]
     rest = few[rng.integers(0, 300, 2000)]
-    vectors, labels = tree_palette(rest, rng.normal(size=2000), 400, 1.0)
+    vectors, labels = fit_tree_palette(rest, rng.normal(size=2000), 400, 1.0)
     assert len(vectors) <= 300
     assert np.abs(vectors[labels] - rest).mean() < 4 / SH_LEVELS
 

@@ -8,13 +8,13 @@ from clsplat.conformance import reference as ref
 from clsplat.formats.packing import morton_order
 from clsplat.formats.palette import ENTRIES, fit_codebook
 from clsplat.formats.sog_quantize import LEVELS, round_means, round_quats, round_to
-from clsplat.formats.splats import WriteOptions, unit
+from clsplat.formats.splats import WriteOptions, normalize_quats
 from clsplat.formats.table import write
 from tests.support.models import round_trip, splats
 
 
 def covariances(quats, log_scales):
-    turns = np.stack([ref.rotation_matrix(quat) for quat in unit(quats)])
+    turns = np.stack([ref.rotation_matrix(quat) for quat in normalize_quats(quats)])
     return np.einsum("nij,nj,nkj->nik", turns, np.exp(2.0 * log_scales), turns)
 
 

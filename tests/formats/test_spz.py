@@ -16,7 +16,7 @@ from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
 from clsplat.core.harmonics import basis
 from clsplat.formats.packing import morton_order
 from clsplat.formats.sog_quantize import log_weights
-from clsplat.formats.splats import ReadOptions, WriteOptions, flip_axes, unit
+from clsplat.formats.splats import ReadOptions, WriteOptions, flip_axes, normalize_quats
 from clsplat.formats.spz import AXES
 from clsplat.formats.table import detect, read, write
 from tests.support.models import angles, assert_close, interop, round_trip, splats, spz_version_4
@@ -191,7 +191,7 @@ def test_declared_axes_are_turned_to_those_of_a_ply(tmp_path, caplog):
         ]
         np.testing.assert_allclose(*colors, atol=1e-5)
         spreads = [
-            Rotation.from_quat(np.roll(unit(one.parameters["quats"]), -1, axis=1)).as_matrix()
+            Rotation.from_quat(np.roll(normalize_quats(one.parameters["quats"]), -1, axis=1)).as_matrix()
             * np.exp(one.parameters["log_scales"])[:, None, :]
             for one in (stored, result)
         ]

@@ -6,7 +6,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from clsplat.data_tools.casting import World, camera_pose
-from clsplat.data_tools.shapes import GOLDEN_ANGLE, Array, Cuboid, Shape, Vector, unit
+from clsplat.data_tools.shapes import GOLDEN_ANGLE, Array, Cuboid, Shape, Vector, normalize
 from clsplat.data_tools.still_life import PRIMES, mix, noise, scramble
 from clsplat.data_tools.synthetic import SyntheticOptions
 
@@ -117,7 +117,7 @@ class City(SyntheticOptions):
         number = np.arange(1, count + 1)
         across = np.stack([(phase + number / PLASTIC**power) % 1 for power in (1, 2)])
         heading, tilt = number * GOLDEN_ANGLE + phase, np.radians(TILTS[0] + (TILTS[1] - TILTS[0]) * (number % 3) / 2)
-        backward = unit(np.stack([np.sin(tilt) * np.cos(heading), np.sin(tilt) * np.sin(heading), np.cos(tilt)]))
+        backward = normalize(np.stack([np.sin(tilt) * np.cos(heading), np.sin(tilt) * np.sin(heading), np.cos(tilt)]))
         looked_at = np.stack([*((2 * across - 1) * self.half), np.zeros(count)])
         position = looked_at + backward * FLIGHT / backward[2]
         return [camera_pose(position[:, i], backward[:, i]) for i in range(count)]

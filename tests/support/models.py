@@ -11,7 +11,7 @@ import pytest
 import clsplat
 from clsplat.conformance.scenes import Case
 from clsplat.formats.splat import HEADER, SECTION
-from clsplat.formats.splats import PARAMETERS, ReadOptions, SplatFile, WriteOptions, opacities, unit
+from clsplat.formats.splats import PARAMETERS, ReadOptions, SplatFile, WriteOptions, normalize_quats, opacities
 from clsplat.formats.table import read, write
 from clsplat.gaussians.model import Model, Rendering
 from tests.support.data_sets import data_set
@@ -63,7 +63,7 @@ def round_trip(
 
 def angles(a: SplatFile, b: SplatFile) -> np.ndarray:
     """The angles between the rotations of two models, [N] degrees."""
-    cosine = np.abs((unit(a.parameters["quats"]) * unit(b.parameters["quats"])).sum(axis=1))
+    cosine = np.abs((normalize_quats(a.parameters["quats"]) * normalize_quats(b.parameters["quats"])).sum(axis=1))
     return np.degrees(2 * np.arccos(np.minimum(cosine, 1)))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from clsplat.data_tools.casting import World, camera_pose
-from clsplat.data_tools.shapes import Array, Cuboid, rotate, unit
+from clsplat.data_tools.shapes import Array, Cuboid, normalize, rotate
 from clsplat.data_tools.still_life import mix, noise
 from clsplat.data_tools.synthetic import STILL_LIFE, surface_points
 from clsplat.scene.camera import FACES, panorama_lens
@@ -51,7 +51,7 @@ class Panoramas(Room):
         lens = panorama_lens(size, size // 2).camera
         right, down = (x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy
         through = np.array([np.cos(down) * np.sin(right), -np.sin(down), -np.cos(down) * np.cos(right)])
-        return pose[:3, 3:], unit(rotate(pose[:3, :3], through))
+        return pose[:3, 3:], normalize(rotate(pose[:3, :3], through))
 
     def photograph(self, pose: Array, size: int) -> "np.ndarray":
         return self.render_rows(pose, size, range(size // 2))
@@ -69,7 +69,7 @@ def poses(count: int, radius: float, phase: float = 0.0) -> list[Array]:
         turn = 2 * np.pi * i / count + phase
         position = np.array([radius * np.cos(turn), radius * np.sin(turn), 0.55 + 0.3 * np.sin(3 * turn)])
         ahead = np.array([np.cos(2.4 * turn + phase), np.sin(2.4 * turn + phase), 0.0])
-        made.append(camera_pose(position, unit(ahead)))
+        made.append(camera_pose(position, normalize(ahead)))
     return made
 
 

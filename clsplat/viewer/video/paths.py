@@ -78,7 +78,7 @@ class Rig:
         forward, (near, far) = self.forwards.mean(axis=0), self.depths
         depth = float(np.median(self._point_depths(focus)))
         if np.linalg.norm(forward) > PARALLEL and not near / DEPTH_MARGIN < depth < far * DEPTH_MARGIN:
-            focus = self.positions.mean(axis=0) + unit(forward) * (near + far) / 2
+            focus = self.positions.mean(axis=0) + normalize(forward) * (near + far) / 2
         if (self._point_depths(focus) > 0).mean() < MIN_FACING:
             raise DataError(
                 "the cameras look away from each other, so there is no center to orbit; use the path `through`"
@@ -115,7 +115,7 @@ class Rig:
         return cameras[len(cameras) // 2]
 
 
-def unit(vectors: Floats) -> Floats:
+def normalize(vectors: Floats) -> Floats:
     """Normalize vectors, [..., 3]."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
@@ -321,8 +321,8 @@ def spiral(rig: Rig, frames: int, size: Size) -> list[View]:
     forward, center = rig.forwards.mean(axis=0), rig.positions.mean(axis=0)
     if np.linalg.norm(forward) < MIN_AGREEMENT:
         raise DataError("the cameras look in many directions, so a spiral has no front; use ellipse or through")
-    forward = unit(forward)
-    right = unit(np.cross(forward, rig.up))
+    forward = normalize(forward)
+    right = normalize(np.cross(forward, rig.up))
     axes = np.stack([right, np.cross(forward, right), forward])
     near, far = rig.depths
     target = center + forward / ((1 - FOCUS_DEPTH) / near + FOCUS_DEPTH / far)
