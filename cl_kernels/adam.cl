@@ -2,6 +2,7 @@
  *
  * adam_step reads gradients from memory.  update_gaussians computes the gradients of the projection itself, which saves
  * writing and reading 59 values per Gaussian; its results equal those of project_backward and adam_step bit for bit.
+ * It also adds the view to the statistics that density.cl would read gradients from memory for.
  *
  * `every`: all ones to update all Gaussians; 0: the values and moments of culled Gaussians do not change.
  * `undrawn`: all ones to update vectors without a Gaussian in the view at once; 0: their harmonics are updated later
@@ -10,6 +11,12 @@
  * One item = LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
 #include "backward.h"
+
+/* What update_gaussians writes in addition to the parameters, as bits of `outputs`. */
+#define OUTPUT_MEAN2D 1    // the gradient of the projected means
+#define OUTPUT_SEEN 2      // statistics: as count_seen
+#define OUTPUT_NORM 4      // as accumulate_norm of the projected means
+#define OUTPUT_ABS_NORM 8  // as accumulate_norm of the sums of absolute values
 
 /* One update of one table.  Dimension 1 is the plane.  With SH_SLOTS the table is in slots (slots.h). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
@@ -64,6 +71,33 @@ static inline void update_plane(__global float *values, __global float *moment1,
                      vectors, waiting, table##_rate, table##_correction2);                                    \
     } while (0)
 
+/* Write the outputs of LANES Gaussians.  x, y: gradient of the projected means; m: sums over pixels. */
+static inline void write_outputs(const uint outputs, __global float *grad_mean2d, __global const float *radius,
+                                 __global float *seen, __global float *norms, const float half_width,
+                                 const float half_height, const uint stride, const uint i, VF x, VF y, const VF *m)
+{
+    if (outputs & OUTPUT_MEAN2D) {
+        VSTORE(x, grad_mean2d + i);
+        VSTORE(y, grad_mean2d + stride + i);
+    }
+    if (!(outputs & (OUTPUT_SEEN | OUTPUT_NORM | OUTPUT_ABS_NORM)))
+        return;
+    const VI visible = VLOAD(radius + i) > 0.0f;
+    if (outputs & OUTPUT_SEEN) {
+        const VF views = VLOAD(seen + i);
+        VSTORE((visible ? views + 1.0f : views), seen + i);
+    }
+#if PIXEL_SUMS > SUM_ABS_Y
+    if (outputs & OUTPUT_ABS_NORM)
+        x = m[SUM_ABS_X], y = m[SUM_ABS_Y];
+#endif
+    if (outputs & (OUTPUT_NORM | OUTPUT_ABS_NORM)) {
+        const VF total = VLOAD(norms + i);
+        x *= half_width, y *= half_height;
+        VSTORE((visible ? total + sqrt(x * x + y * y) : total), norms + i);
+    }
+}
+
 /* The update of all tables from the sums over pixels.  Rates are divided by 1 - BETA1^t.
  *
  * One item = VECTORS vectors of Gaussians, plane by plane, so that memory is read contiguously; vectors without an
@@ -94,6 +128,9 @@ void update_gaussians(
     __global const float *restrict splats,           // [N,RECORD] see splat.h
     __global const float *restrict pixel_sums,       // [PIXEL_SUMS,S] see splat.h
     __global float *restrict grad_mean2d,            // [2,S] px^-1
+    __global const float *restrict radius,           // [S] px, 0 = not seen
+    __global float *restrict seen,                   // [S] views
+    __global float *restrict norms,                  // [S] over views
     const float near_plane,                          // scene units
     const float screen_variance,                     // px^2
     const float compensate,                          // 0 or 1
@@ -111,6 +148,9 @@ void update_gaussians(
     const float sh_rest_correction2,
     const uint degree,
     const uint sh_rest_degree,                       // of the bands to update: 0 or `degree`
+    const float half_width,                          // px
+    const float half_height,                         // px
+    const uint outputs,
     const uint every,
     const uint undrawn,
     const uint sh_block,                             // values of a block in a slot
@@ -123,18 +163,19 @@ void update_gaussians(
     uint first[VECTORS], active = 0, unseen = 0;
     gradient_t g[VECTORS];
     VI updated[VECTORS];
-    VF weights[VECTORS][16];
+    VF weights[VECTORS][16], m[VECTORS][PIXEL_SUMS];
     for (uint v = 0; v < VECTORS && i + v * LANES < count; v++) {
         const uint at = i + v * LANES;
-        color_backward(splats, pixel_sums, stride, count, at, g + active);
+        load_sums(pixel_sums, stride, at, m[active]);
+        color_backward(splats, m[active], count, at, g + active);
         first[active] = at;
         updated[active] = g[active].touched | (VI)((int)every);
         if (ANY(updated[active])) {
             unseen |= (ANY(g[active].touched) ? 0u : 1u) << active;
             active++;
         } else {
-            for (uint k = 0; k < 2; k++)
-                VSTORE((VF)(0.0f), grad_mean2d + k * stride + at);
+            write_outputs(outputs, grad_mean2d, radius, seen, norms, half_width, half_height, stride, at, (VF)(0.0f),
+                          (VF)(0.0f), m[active]);
         }
     }
     if (active == 0)
@@ -150,16 +191,13 @@ void update_gaussians(
     weigh_harmonics(sh_rest, g, vectors, unseen, degree, stride, sh_index, weights);
     for (uint v = 0; v < vectors; v++) {
         const uint at = first[v];
-        if ((unseen >> v) & 1) {
+        if ((unseen >> v) & 1)
             no_gradient(g + v);
-            for (uint k = 0; k < 2; k++)
-                VSTORE((VF)(0.0f), grad_mean2d + k * stride + at);
-            continue;
-        }
-        gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[v],
-                    near_plane, screen_variance, compensate, degree, stride, at, g + v);
-        for (uint k = 0; k < 2; k++)
-            VSTORE((g[v].touched ? g[v].mean2d[k] : (VF)(0.0f)), grad_mean2d + k * stride + at);
+        else
+            gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, m[v], weights[v], near_plane,
+                        screen_variance, compensate, degree, stride, at, g + v);
+        write_outputs(outputs, grad_mean2d, radius, seen, norms, half_width, half_height, stride, at,
+                      g[v].touched ? g[v].mean2d[0] : (VF)(0.0f), g[v].touched ? g[v].mean2d[1] : (VF)(0.0f), m[v]);
     }
     for (uint k = 0; k < 3; k++)
         UPDATE(means, k, means[k]);

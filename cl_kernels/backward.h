@@ -115,11 +115,18 @@ typedef struct {
     VF basis[16], color[3];
 } gradient_t;
 
+/* The sums over pixels of LANES Gaussians. */
+static inline void load_sums(__global const float *pixel_sums, const uint stride, const uint i, VF *m)
+{
+    for (uint k = 0; k < PIXEL_SUMS; k++)
+        m[k] = VLOAD(pixel_sums + k * stride + i);
+}
+
 /* Which Gaussians were rendered, and the gradients of their colors. */
 static inline void color_backward(
-    __global const float *splats,      // [N,RECORD] see splat.h
-    __global const float *pixel_sums,  // [PIXEL_SUMS,S] see splat.h
-    const uint stride, const uint count, const uint i, gradient_t *g)
+    __global const float *splats,  // [N,RECORD] see splat.h
+    const VF *m,                   // [PIXEL_SUMS] see splat.h
+    const uint count, const uint i, gradient_t *g)
 {
     float table[4][LANES];
     for (uint lane = 0; lane < LANES; lane++)
@@ -127,8 +134,7 @@ static inline void color_backward(
             table[k][lane] = i + lane < count ? splats[(size_t)(i + lane) * RECORD + SPLAT_OPACITY + k] : 0.0f;
     g->touched = VLOAD_PRIVATE(table[0]) > 0.0f;  // culled records are all zero
     for (uint channel = 0; channel < 3; channel++)  // max(0, .) passes no gradient where it clamps
-        g->color[channel] = VLOAD_PRIVATE(table[1 + channel]) > 0.0f
-                                 ? VLOAD(pixel_sums + (SUM_RED + channel) * stride + i) : (VF)(0.0f);
+        g->color[channel] = VLOAD_PRIVATE(table[1 + channel]) > 0.0f ? m[SUM_RED + channel] : (VF)(0.0f);
 }
 
 /* The weight of each basis function in the derivative with respect to the direction, c_k . g, for the vectors whose
@@ -173,16 +179,13 @@ static inline void gradient_of(
     __global const float *logit_opacity,    // [S]
     __global const float *filter_variance,  // [S] scene units^2
     __constant camera_t *camera,            // [1]
-    __global const float *pixel_sums,       // [PIXEL_SUMS,S] see splat.h
+    const VF *m,                            // [PIXEL_SUMS] see splat.h
     const VF *weights,                      // [16]
     const float near_plane, const float screen_variance, const float compensate, const uint degree,
     const uint stride, const uint i, gradient_t *g)
 {
     shape_t s;
     shape_of(means, quats, log_scales, filter_variance, camera, near_plane, screen_variance, compensate, stride, i, &s);
-    VF m[PIXEL_SUMS];
-    for (uint k = 0; k < PIXEL_SUMS; k++)
-        m[k] = VLOAD(pixel_sums + k * stride + i);
     shape_backward(&s, camera, m, screen_variance, compensate, g->mean2d, g->means, g->quats, g->log_scales, &g->focal);
     VF d[3], gd[3] = {0.0f, 0.0f, 0.0f};
     const VF inverse_distance = view_direction(means, camera, stride, i, d);

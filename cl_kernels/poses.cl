@@ -69,11 +69,12 @@ void pose_gradient(
         parts[k][item] = 0.0f;
     if (i < count) {
         gradient_t g;
-        VF weights[1][16], terms[POSE_SUMS];
+        VF weights[1][16], m[PIXEL_SUMS], terms[POSE_SUMS];
         const uint sh_index = sh_first(sh_slot, sh_block, i);
-        color_backward(splats, pixel_sums, stride, count, i, &g);
+        load_sums(pixel_sums, stride, i, m);
+        color_backward(splats, m, count, i, &g);
         weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &sh_index, weights);
-        gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0],
+        gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, m, weights[0],
                     near_plane, screen_variance, compensate, degree, stride, i, &g);
         pose_terms(means, quats, camera, &g, weights[0], degree, stride, i, terms);
         for (uint k = 0; k < POSE_SUMS; k++)

@@ -185,11 +185,12 @@ void project_backward(
     if (i >= count)
         return;
     gradient_t g;
-    VF weights[1][16];
+    VF weights[1][16], m[PIXEL_SUMS];
     const uint sh_index = sh_first(sh_slot, sh_block, i);
-    color_backward(splats, pixel_sums, stride, count, i, &g);
+    load_sums(pixel_sums, stride, i, m);
+    color_backward(splats, m, count, i, &g);
     weigh_harmonics(sh_rest, &g, 1, !ANY(g.touched), degree, stride, &sh_index, weights);
-    gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, pixel_sums, weights[0], near_plane,
+    gradient_of(means, quats, log_scales, logit_opacity, filter_variance, camera, m, weights[0], near_plane,
                 screen_variance, compensate, degree, stride, i, &g);
     store_planes(grad_means, g.means, g.touched, 3, stride, i);
     store_planes(grad_quats, g.quats, g.touched, 4, stride, i);

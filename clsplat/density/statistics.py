@@ -121,6 +121,12 @@ class BlendWeight(Statistic):
 StatisticName = Annotated[str, VariantName(Statistic, lambda cls: cls.components == 1)]
 
 
+# Statistics that the update of parameters can add to, with its bit for them (adam.cl).
+_MEAN2D, _SEEN, _NORM, _ABS_NORM = (
+    int(constants("adam.cl")[f"OUTPUT_{name}"]) for name in ("MEAN2D", "SEEN", "NORM", "ABS_NORM")
+)
+IN_UPDATE = {"screen_grad": _NORM, "screen_grad_abs": _ABS_NORM}
+
 # Statistics that only launch kernels, with arguments that depend only on sizes and memory.
 PLANNED = {"screen_grad", "screen_grad_abs", "screen_grad_abs_sum", "texture", "screen_radius", "blend_weight"}
 
@@ -140,6 +146,7 @@ class SplatStats:
         classes = variants(Statistic)
         all_names = {*names, *(classes[name].divisor for name in names)}
         self.columns = {name: cls() for name, cls in classes.items() if name in all_names}
+        self._in_update = next((name for name in IN_UPDATE if name in self.columns), None)
         tables = {SEEN: 1} | {PREFIX + name: column.components for name, column in self.columns.items()}
         for name in [name for name in gaussians.tables if name.startswith(PREFIX) and name not in tables]:
             del gaussians.tables[name]
@@ -174,24 +181,37 @@ class SplatStats:
         """The number of views in which each Gaussian is visible, [S]."""
         return self.gaussians[SEEN]
 
-    def add(self, gradients: ViewGradients, grad_mean2d: Array) -> None:
-        """Add a view to all statistics.  grad_mean2d: [2, S] px⁻¹."""
+    def update_arguments(self) -> dict[str, Any]:
+        """Return arguments with which `Adam.update` adds a view to the number of views and to at most one statistic."""
+        name = self._in_update
+        bits = _SEEN | (IN_UPDATE[name] if name else 0) | (_MEAN2D if len(self.columns) > bool(name) else 0)
+        return {"seen": self.view_count, "norms": self.total(name) if name else self.view_count, "outputs": bits}
+
+    def add(self, gradients: ViewGradients, grad_mean2d: Array, after_update: bool = False) -> None:
+        """Add a view to all statistics.  grad_mean2d: [2, S] px⁻¹.
+
+        after_update: except to those to which `Adam.update` added it.
+        """
         gaussians, frame = self.gaussians, gradients.frame
+        names = [name for name in self.columns if not (after_update and name == self._in_update)]
+        if after_update and not names:
+            return
 
         def launch() -> None:
-            gaussians.device.program("density.cl").count_seen(
-                items=gaussians.count, radius=frame.radius, seen=self.view_count, count=gaussians.count
-            )
-            for name in filter(PLANNED.__contains__, self.columns):
+            if not after_update:
+                gaussians.device.program("density.cl").count_seen(
+                    items=gaussians.count, radius=frame.radius, seen=self.view_count, count=gaussians.count
+                )
+            for name in filter(PLANNED.__contains__, names):
                 self.columns[name].add(gaussians, gradients, grad_mean2d, self.total(name))
 
         arrays = grad_mean2d, gradients.pixel_sums, frame.radius
         size = frame.camera.width, frame.camera.height
-        key = "statistics", gaussians.key, size, *(array.buffer.serial for array in arrays)
+        key = "statistics", gaussians.key, size, after_update, *(array.buffer.serial for array in arrays)
         self._plans.run(key, {}, launch)
-        for name, column in self.columns.items():
+        for name in names:
             if name not in PLANNED:
-                column.add(gaussians, gradients, grad_mean2d, self.total(name))
+                self.columns[name].add(gaussians, gradients, grad_mean2d, self.total(name))
 
     def mean(self, name: str) -> NDArray[np.float32]:
         """Return the mean of a scalar statistic, on the host, [N]; 0 where the divisor is 0."""

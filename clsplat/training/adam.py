@@ -97,6 +97,7 @@ Rows = Literal["all", "seen", "deferred"]  # rows to update; deferred: all rows,
 _EVERY = {"all": 0xFFFFFFFF, "seen": 0, "deferred": 0xFFFFFFFF}
 _FACTORS = {name: (f"{name}_rate", f"{name}_correction2") for name in PARAMETERS}  # kernel arguments
 _UNDRAWN = {"all": 0xFFFFFFFF, "seen": 0xFFFFFFFF, "deferred": 0}
+_MEAN2D, _ABS_NORM = (int(constants("adam.cl")[f"OUTPUT_{name}"]) for name in ("MEAN2D", "ABS_NORM"))
 
 
 class Adam:
@@ -124,19 +125,32 @@ class Adam:
                 gaussians.add(moment, gaussians.tables[name].components, zero_fresh=True)
 
     def update(
-        self, model: DeviceModel, frame: Frame, pixel_sums: Array, rates: dict[str, float], rows: Rows = "all"
+        self,
+        model: DeviceModel,
+        frame: Frame,
+        pixel_sums: Array,
+        rates: dict[str, float],
+        rows: Rows = "all",
+        statistics: Mapping[str, Any] | None = None,
     ) -> Array:
         """Update all parameters from the frame's sums over pixels, [PIXEL_SUMS, S].
 
         Returns the gradient of the projected means, [2, S] px⁻¹, which is valid until the next update.
+        statistics: the statistics to add to, see `SplatStats.update_arguments`; without them, only this gradient is
+        written.
         """
         gaussians, rows, grad_mean2d = self.gaussians, self._effective_rows(rows), self._mean2d()
+        unused = {"seen": grad_mean2d, "norms": grad_mean2d}
+        outputs = {**unused, "radius": frame.radius, "outputs": _MEAN2D, **(statistics or {})}
+        bits = outputs.pop("outputs")
+        defines = {**model.defines, **({"PIXEL_SUMS": pixel_sums.shape[0]} if bits & _ABS_NORM else {})}
         deferred = self._prepare_deferred(rows, model, rates)
         changes: dict[str, Any] = {"camera": frame.camera.array}
         for name, (rate_name, correction_name) in _FACTORS.items():
             changes[rate_name], changes[correction_name] = self._count_update(name, rates)
         changes["sh_rest_degree"] = model.degree if rates["sh_rest"] else 0
-        arrays: dict[str, Any] = {"splats": frame.splats, "pixel_sums": pixel_sums, "grad_mean2d": grad_mean2d}
+        changes["half_width"], changes["half_height"] = frame.camera.width / 2, frame.camera.height / 2
+        arrays = {"splats": frame.splats, "pixel_sums": pixel_sums, "grad_mean2d": grad_mean2d, **outputs}
 
         def launch() -> None:
             tables: dict[str, Any] = {
@@ -144,16 +158,17 @@ class Adam:
                 for name in PARAMETERS
                 for number, table in enumerate(moment_tables(name), 1)
             }
-            gaussians.device.program("adam.cl", **model.defines).update_gaussians(
+            gaussians.device.program("adam.cl", **defines).update_gaussians(
                 items=-(-gaussians.count // (self._lanes * self._vectors)),
                 **{**projection_arguments(model, frame.camera), **arrays, **changes},
                 **tables,
                 sh_base=gaussians["sh_base"],
+                outputs=bits,
                 every=_EVERY[rows],
                 undrawn=_UNDRAWN[rows],
             )
 
-        key = "update", model.key, rows, *(array.buffer.serial for array in arrays.values())
+        key = "update", model.key, rows, bits, *(array.buffer.serial for array in arrays.values())
         self._plans.run(key, changes, launch)
         self._record_sh(deferred, frame, changes["sh_rest_rate"], changes["sh_rest_correction2"])
         return grad_mean2d

@@ -146,18 +146,18 @@ class StepTrainer:
 
     def update(self, gradients: ViewGradients, frozen: Collection[str] = ()) -> None:
         """Update the parameters, Adam's moments, the statistics, and the modules with the result of `differentiate`."""
-        grad_mean2d = self._update_parameters(gradients, frozen)
+        grad_mean2d, has_statistics = self._update_parameters(gradients, frozen)
         for module in reversed(gradients.step.modules):  # in the order in which the device finished their gradients
             module.update(gradients.step)
         self.rasterizer.device.timings.section = "statistics"
-        self.stats.add(gradients, grad_mean2d)
+        self.stats.add(gradients, grad_mean2d, has_statistics)
 
-    def _update_parameters(self, view_gradients: ViewGradients, frozen: Collection[str]) -> Array:
+    def _update_parameters(self, view_gradients: ViewGradients, frozen: Collection[str]) -> tuple[Array, bool]:
         """Update the parameters and add the penalties to the view's losses.
 
-        Returns the gradient of the projected means, [2, S] px⁻¹.  A fused kernel updates the parameters without writing
-        gradients to memory, unless the training uses penalties, frozen parameters, motion, depths, or several views per
-        update.
+        Returns the gradient of the projected means, [2, S] px⁻¹, and whether statistics were added.  A fused kernel
+        updates the parameters and adds statistics without writing gradients to memory, unless the training uses
+        penalties, frozen parameters, motion, depths, or several views per update.
         """
         penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         step = view_gradients.comparison.step
@@ -165,18 +165,19 @@ class StepTrainer:
         gaussians, has_depth = self.model.gaussians, view_gradients.frame.content == "inverse_depth"
         has_several_views = self.views_per_update != 1
         if not (penalties or frozen or gaussians.is_moving or has_depth or has_several_views):
-            return self.adam.update(self.model, view_gradients.frame, view_gradients.pixel_sums, rates, self.rows)
+            inputs = self.model, view_gradients.frame, view_gradients.pixel_sums, rates, self.rows
+            return self.adam.update(*inputs, self.stats.update_arguments()), True
         gradients = self.rasterizer.gradients(self.model, view_gradients.frame, view_gradients.pixel_sums)
         is_deferred = self.rows == "deferred" or gaussians.on_host
         penalty_gradients = gradients.without_deferred() if is_deferred else gradients
-        inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, penalty_gradients, self.extent, step)
+        penalty_inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, penalty_gradients, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
-        view_gradients.losses.extend(require_loss_value(penalty, penalty.add(inputs)) for penalty in penalties)
+        view_gradients.losses.extend(require_loss_value(penalty, penalty.add(penalty_inputs)) for penalty in penalties)
         if has_several_views:
             attach_gradients(gaussians)
             gradients = add_gradients(gaussians, gradients)
             if step % int(at_step(self.views_per_update, step)):
-                return gradients.mean2d
+                return gradients.mean2d, False
             gaussians[VIEWS].fill(0)
         self.adam.step(self.model, view_gradients.frame, gradients, rates, frozen, self.rows)
-        return gradients.mean2d
+        return gradients.mean2d, False

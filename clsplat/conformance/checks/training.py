@@ -12,6 +12,7 @@ from clsplat.conformance.checks.blending import BACKGROUND
 from clsplat.conformance.checks.projection import COUNTS as DROPOUT_COUNTS
 from clsplat.conformance.checks.projection import check_gradient, check_record, expected_gradients, project_records
 from clsplat.conformance.scenes import Case, add_world_filter, random_case
+from clsplat.density.statistics import ABS_X, SplatStats
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.deferred import DeferredHarmonics
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, DropoutMask, Gaussians, hide
@@ -20,7 +21,7 @@ from clsplat.losses.base import Penalty, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
 from clsplat.methods.natural_selection import OpacityPressure
 from clsplat.opencl.device import Array, Device, constants
-from clsplat.render.rasterizer import RECORD, Frame, Rasterizer
+from clsplat.render.rasterizer import PIXEL_SUMS, RECORD, Frame, Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training import adam
 from clsplat.training.adam import Adam, Rates, Rows
@@ -65,25 +66,43 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
 
 
 def _random_pixel_sums(
-    device: Device, rng: np.random.Generator, case: Case, rasterizer: Rasterizer, model: DeviceModel
+    device: Device,
+    rng: np.random.Generator,
+    case: Case,
+    rasterizer: Rasterizer,
+    model: DeviceModel,
+    count: int = PIXEL_SUMS,
 ) -> tuple[Frame, Array]:
     """Return the frame of a case, and its sums over pixels for a random gradient of the image."""
     camera = case.device_camera(device)
     frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
     weights = np.zeros((3, camera.rows, camera.stride), np.float32)
     weights[:, : camera.height, : camera.width] = rng.normal(size=(3, camera.height, camera.width))
-    return frame, rasterizer.pixel_sums(model, frame, device.upload(weights))
+    return frame, rasterizer.pixel_sums(model, frame, device.upload(weights), count)
 
 
-def check_fused(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare moments and values after one fused update.  Expected values are computed from the device's moments."""
+def check_fused(
+    device: Device, rng: np.random.Generator, case: Case, label: str, statistic: str = "screen_grad"
+) -> Results:
+    """Compare moments, values, and a statistic after one fused update.
+
+    Expected values are computed from the device's moments, and from its sums over pixels.
+    """
     kernel, count = "update_gaussians", len(case.parameters["means"])
     rasterizer, model = Rasterizer(device, "radix"), case.model(device)
     gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
-    frame, pixel_sums = _random_pixel_sums(device, rng, case, rasterizer, model)
-    grad_mean2d = adam.update(model, frame, pixel_sums, rates).get()[:, :count].T
-    expected = expected_gradients(case, case.project(), pixel_sums.get()[:, :count].T.astype(np.float64))
+    stats = SplatStats(gaussians, [statistic, "screen_radius"])  # the update does not add the radius
+    frame, pixel_sums = _random_pixel_sums(device, rng, case, rasterizer, model, stats.pixel_sums)
+    stats.view_count.fill(2)
+    stats.total(statistic).fill(1)
+    grad_mean2d = adam.update(model, frame, pixel_sums, rates, statistics=stats.update_arguments()).get()[:, :count].T
+    sums = pixel_sums.get()[:, :count].T.astype(np.float64)
+    expected = expected_gradients(case, case.project(), sums[:, :PIXEL_SUMS])
     yield compare(kernel, f"gradients of the projected means, {label}", grad_mean2d, expected["mean2d"], CONIC)
+    planes, is_visible = sums[:, ABS_X:] if stats.pixel_sums > ABS_X else grad_mean2d, frame.radius.get()[:count] > 0
+    norms = 1 + is_visible * ref.screen_gradient(planes.astype(np.float64), *case.size)
+    yield compare_max(kernel, f"{statistic}, {label}", stats.total(statistic).get()[0, :count], norms, SUM)
+    yield match(kernel, f"views, {label}", stats.view_count.get()[0, :count], 2.0 + is_visible)
     for name in PARAMETERS:
         moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in moment_tables(name))
         yield compare(kernel, f"first moment of {name}, {label}", moment1, 0.1 * expected[name], CONIC)
@@ -152,8 +171,8 @@ def adam_of_seen_rows(device: Device, rng: np.random.Generator) -> Results:
 def update_from_sums_over_pixels(device: Device, rng: np.random.Generator) -> Results:
     for count, degree in ((1, 3), (17, 0), (40, 2), (150, 3)):
         case = add_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng)
-        label = f"{count} Gaussians, degree {degree}"
-        yield from check_fused(device, rng, move_every_fifth_behind(case), label)
+        label, statistic = f"{count} Gaussians, degree {degree}", "screen_grad_abs" if count == 40 else "screen_grad"
+        yield from check_fused(device, rng, move_every_fifth_behind(case), label, statistic)
 
 
 def check_penalty(
