@@ -24,11 +24,14 @@
 #ifndef DIGIT_BITS
 #define DIGIT_BITS 11  // widest radix digit: its table is TEAM << DIGIT_BITS counters of local memory
 #endif
+#ifndef COUNT_TILES
+#define COUNT_TILES 0  // 1: the pairs of each tile are counted as they are listed, for the bitonic sort
+#endif
 #ifndef BITONIC_GROUP
-#define BITONIC_GROUP 64  // items per tile in the bitonic sort
+#define BITONIC_GROUP 128  // items that sort a run in the bitonic sort
 #endif
 #ifndef SORT_CAPACITY
-#define SORT_CAPACITY 1024  // pairs of a tile that the bitonic sort holds in local memory, 8 bytes each
+#define SORT_CAPACITY 1024  // pairs of a run that the bitonic sort holds in local memory, 8 bytes each
 #endif
 #ifndef PIXEL_SUMS
 #define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11, 13 or 15 if a density statistic needs more

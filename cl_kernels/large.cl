@@ -40,12 +40,15 @@ static inline uint count_part(const footprint_t *f, const rows_t part)
     return (uint)sum_lanes(count);
 }
 
-/* tile_count[i] = tiles that a large splat touches; other counts are unchanged.  Local memory: TEAM * 4 bytes. */
+/* tile_count[i] = tiles that a large splat touches; other counts are unchanged.  With COUNT_TILES, reset the number of
+ * pairs of each tile.  Local memory: TEAM * 4 bytes. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void count_large(
-    __global const float *restrict splats,   // [N,RECORD] see splat.h
-    __global const uint *restrict tile_box,  // [S] see tiles.h
-    __global uint *restrict tile_count,      // [S]
+    __global const float *restrict splats,    // [N,RECORD] see splat.h
+    __global const uint *restrict tile_box,   // [S] see tiles.h
+    __global uint *restrict tile_count,       // [S]
+    __global uint *restrict tile_pair_count,  // [T]
+    const uint tiles,
     const uint tiles_x,
     const uint row_begin,                    // of the band of tiles
     const uint row_end,
@@ -54,6 +57,9 @@ void count_large(
 {
     __local uint sums[TEAM];
     const uint item = get_local_id(0), first = get_group_id(0) * run;
+    if (COUNT_TILES)
+        for (uint tile = get_global_id(0); tile < tiles; tile += get_global_size(0))
+            tile_pair_count[tile] = 0;
     for (uint i = first; i < first + run && i < count; i++)
         if (IS_LARGE(tile_box[i])) {
             footprint_t f;
@@ -123,6 +129,7 @@ void emit_large(
     __global const uint *restrict pair_count,  // [1] 0 if the pairs exceed the capacity
     __global uint *restrict pair_tile,         // [capacity]
     __global uint *restrict pair_splat,        // [capacity]
+    __global uint *restrict tile_pair_count,   // [T] pairs of other splats
     const uint tiles_x,
     const uint row_begin,                      // of the band of tiles
     const uint row_end,
@@ -153,6 +160,11 @@ void emit_large(
                 pair_tile[slot] = last;
                 pair_splat[slot] = i;
             }
+#if COUNT_TILES
+            barrier(CLK_GLOBAL_MEM_FENCE);
+            for (uint slot = begin + item; slot < end; slot += TEAM)
+                atomic_inc(tile_pair_count + pair_tile[slot]);
+#endif
             barrier(CLK_LOCAL_MEM_FENCE);  // keeps the group together: a runtime may split the loop after a branch
         }
 }

@@ -16,6 +16,7 @@ void emit_pairs(
     __global uint *restrict pair_splat,         // [capacity]
     __global uint *restrict first_pair,         // [N] first pair of each Gaussian
     __global uint *restrict pair_count,         // [1] listed pairs
+    __global uint *restrict tile_pair_count,    // [T] starts at 0
     const uint tiles_x,
     const uint capacity,
     const uint count)
@@ -37,6 +38,8 @@ void emit_pairs(
             pair_tile[pair] = tile + column;
             pair_splat[pair] = i;
             pair++;
+            if (COUNT_TILES)
+                atomic_inc(tile_pair_count + tile + column);
         }
         column++;
         if (column == width) {

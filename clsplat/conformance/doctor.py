@@ -23,7 +23,7 @@ from clsplat.opencl.device import Device
 from clsplat.opencl.discovery import DeviceInfo, choose_device, resolve_schedule
 from clsplat.opencl.kernel_caches import kernel_caches
 
-BITONIC = {"count_pairs", "fill_tiles", "sort_tiles"}  # kernels that `rasterizer.sort: radix` does not use
+BITONIC = {"fill_tiles", "sort_tiles", "merge_runs"}  # kernels that `rasterizer.sort: radix` does not use
 REPORT = "report the failure, and attach the page that `clsplat doctor --html FILE` writes"
 REMEDY = f"update the device's driver or use another device (`clsplat devices` lists them), and {REPORT}"
 

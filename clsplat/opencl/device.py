@@ -68,6 +68,11 @@ class Timings:
         if self.sampling:
             self._events.append((name, self.section, event))
 
+    @property
+    def launches(self) -> int:
+        """The number of launches since the last call of `take`."""
+        return len(self._events)
+
     def take(self) -> dict[tuple[str, str], list[float]]:
         """Return the seconds of each launch since the last call, by kernel and section.
 

@@ -194,5 +194,4 @@ def tuning_macros(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[s
         "TEAM": 64,
         "DIGIT_BITS": 4,
         "TILE": 16 if info.group >= 256 else 8,
-        "SORT_CAPACITY": 2048,
     }

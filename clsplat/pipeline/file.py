@@ -112,7 +112,7 @@ class RasterizerSettings(Settings):
     schedule: Schedule = "auto"
     """Blending schedule: wide for CPUs, simt for GPUs."""
     sort: Sort = "auto"
-    """Algorithm that sorts splats by tile and depth; auto: the faster one on the first frame."""
+    """Algorithm that sorts splats by tile and depth; auto: bitonic on GPUs unless lists are very long, else radix."""
     pair_budget: Annotated[int, Field(gt=0)] | None = None
     """Memory for gradient records, MiB; default: the largest buffer of the device."""
     harmonics: Harmonics = "auto"

@@ -5,7 +5,6 @@ that order, and then sorts them stably by tile.  `bitonic` emits the pairs in th
 by (depth, index).  Both break ties by index.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,12 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from clsplat.opencl.device import Array, Device
+from clsplat.opencl.device import Array, Device, constants
 from clsplat.render.workspace import GROWTH, Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
 Defines = dict[str, int] | None  # macros of the projection
-TRIALS = 3  # number of timed runs of each sort, before `auto` chooses
+COUNTING: dict[Sort, dict[str, int]] = {"radix": {}, "bitonic": {"COUNT_TILES": 1}}  # macros of the kernels that list
+SORT_CAPACITY = int(constants()["SORT_CAPACITY"])
+LONG_LIST = 32 * SORT_CAPACITY  # pairs; the bitonic sort compares each run of a list with all others
 MAX_SINGLE_GROUP_RUN = 32  # values per item up to which one group scans everything
 MAX_SCAN_BLOCKS = 1024  # each block adds up the sums of all previous blocks
 
@@ -94,7 +95,7 @@ def resolve_sort(device: Device, sort: Sort) -> Sort:
 
 
 class Tiler:
-    """Builds tile lists.  sort: `auto` is `radix` on CPUs; on GPUs, the first frame measures which sort is faster."""
+    """Builds tile lists.  sort: `auto` is `radix` on CPUs, and where the mean list is longer than LONG_LIST."""
 
     def __init__(self, device: Device, workspace: Workspace, sort: Sort = "auto") -> None:
         self.device, self.workspace = device, workspace
@@ -116,11 +117,12 @@ class Tiler:
         The lists are valid if `has_room` is true.  limit: maximum number of pairs.  Raises TooManyPairs
         like `has_room`.
         """
-        if self.sort == "auto":
-            self.sort = self._measure_faster_sort(splats, footprints, band, count, limit, defines)
-        plans, inputs = self.workspace.plans, (splats, footprints, band, count, defines)
+        sort = self.sort
+        if sort == "auto":
+            sort = "radix" if self._capacity > LONG_LIST * band.tiles_inside else "bitonic"
+        plans, inputs = self.workspace.plans, (splats, footprints, band, count, sort, defines)
         serials = (array.buffer.serial for array in (splats, *vars(footprints).values(), self._zero))
-        key = self.sort, band, count, *(defines or {}).items(), *serials
+        key = sort, band, count, *(defines or {}).items(), *serials
         order, pair_offset = plans.run(("order", key), {}, self._order, *inputs)
         read_pairs = pair_offset.get_item_later(count)
         if not self._capacity:
@@ -130,12 +132,14 @@ class Tiler:
         return TileLists(read_pairs, capacity, limit, *lists)
 
     def _order(
-        self, splats: Array, footprints: Footprints, band: Band, count: int, defines: Defines
+        self, splats: Array, footprints: Footprints, band: Band, count: int, sort: Sort, defines: Defines
     ) -> tuple[Array, Array]:
         """Return the order in which pairs are emitted, [N], and the first pair of each position in it, [N+1]."""
         large = self._large_arguments(splats, footprints, band, count)
-        self.device.program("large.cl", **(defines or {})).count_large(**large)
-        order = self._depth_order(footprints.depth_key, count) if self.sort == "radix" else self._index_order(count)
+        self.device.program("large.cl", **(defines or {}), **COUNTING[sort]).count_large(tiles=band.tiles, **large)
+        if sort == "bitonic":
+            return self._index_order(count), self.scan(footprints.tile_count, count, "pair_offset")
+        order = self._depth_order(footprints.depth_key, count)
         ordered_count = self.workspace.array("ordered_count", count, np.uint32)
         self._scan.permute(items=count, values=footprints.tile_count, order=order, permuted=ordered_count, count=count)
         return order, self.scan(ordered_count, count, "pair_offset")
@@ -149,13 +153,15 @@ class Tiler:
         footprints: Footprints,
         band: Band,
         count: int,
+        sort: Sort,
         defines: Defines,
     ) -> tuple[Array, ...]:
         """List up to `capacity` pairs; return the arrays of TileLists."""
         pair_tile, pair_splat = self._pair_array("pair_tile", capacity), self._pair_array("pair_splat", capacity)
         first_pair = self.workspace.array("first_pair", count, np.uint32)
         pair_count = self.workspace.array("pair_count", 1, np.uint32)
-        self._pairs.emit_pairs(
+        large = self._large_arguments(splats, footprints, band, count)
+        self.device.program("pairs.cl", **COUNTING[sort]).emit_pairs(
             items=max(count, 1),
             tile_box=footprints.tile_box,
             tile_mask=footprints.tile_mask,
@@ -165,22 +171,23 @@ class Tiler:
             pair_splat=pair_splat,
             first_pair=first_pair,
             pair_count=pair_count,
+            tile_pair_count=large["tile_pair_count"],
             tiles_x=band.tiles_x,
             capacity=capacity,
             count=count,
         )
-        self.device.program("large.cl", **(defines or {})).emit_large(
-            **self._large_arguments(splats, footprints, band, count),
+        self.device.program("large.cl", **(defines or {}), **COUNTING[sort]).emit_large(
+            **large,
             first_pair=first_pair,
             pair_count=pair_count,
             pair_tile=pair_tile,
             pair_splat=pair_splat,
         )
-        if self.sort == "radix":
+        if sort == "radix":
             tile_offset, tile_pairs = self._sort_by_tile(pair_tile, pair_count, capacity, band.tiles)
         else:
             tile_offset, tile_pairs = self._sort_in_tiles(
-                pair_tile, pair_splat, footprints.depth_key, pair_count, capacity, band.tiles
+                pair_tile, pair_splat, footprints.depth_key, pair_count, large["tile_pair_count"], capacity, band.tiles
             )
         return pair_splat, first_pair, footprints.tile_count, tile_offset, tile_pairs
 
@@ -209,9 +216,18 @@ class Tiler:
     def _large_arguments(self, splats: Array, footprints: Footprints, band: Band, count: int) -> dict[str, Any]:
         """Return the arguments of both kernels for large splats.  On GPUs, each work-item checks one splat."""
         run = self._team if self._team > 1 else self._runs(count, min_run=1 << 8)[0]
-        arguments = {"groups": -(-count // run), "run": run, "count": count}
-        arguments |= {"tiles_x": band.tiles_x, "row_begin": band.row_begin, "row_end": band.row_end}
-        return {**arguments, "splats": splats, "tile_box": footprints.tile_box, "tile_count": footprints.tile_count}
+        return {
+            "groups": max(1, -(-count // run)),
+            "run": run,
+            "count": count,
+            "tiles_x": band.tiles_x,
+            "row_begin": band.row_begin,
+            "row_end": band.row_end,
+            "splats": splats,
+            "tile_box": footprints.tile_box,
+            "tile_count": footprints.tile_count,
+            "tile_pair_count": self.workspace.array("tile_pair_count", band.tiles, np.uint32),
+        }
 
     def scan(self, values: Array, count: int, name: str) -> Array:
         """Return the exclusive prefix sum of `count` values, [count + 1] with the total at the end."""
@@ -295,40 +311,30 @@ class Tiler:
         return tile_offset, tile_pairs
 
     def _sort_in_tiles(
-        self, pair_tile: Array, pair_splat: Array, depth_key: Array, pair_count: Array, capacity: int, tiles: int
+        self,
+        pair_tile: Array,
+        pair_splat: Array,
+        depth_key: Array,
+        pair_count: Array,
+        tile_pair_count: Array,
+        capacity: int,
+        tiles: int,
     ) -> tuple[Array, Array]:
-        tile_fill = self.workspace.array("tile_fill", tiles, np.uint32)
-        tile_fill.fill(0)
-        bitonic = self.device.program("sort_bitonic.cl")
-        bitonic.count_pairs(items=capacity, pair_tile=pair_tile, pair_count=pair_count, tile_pair_count=tile_fill)
-        tile_offset = self.scan(tile_fill, tiles, "tile_offset")
-        tile_fill.fill(0)
+        tile_offset = self.scan(tile_pair_count, tiles, "tile_offset")
         tile_depth, tile_pairs = self._pair_array("tile_depth", capacity), self._pair_array("tile_pairs", capacity)
+        bitonic = self.device.program("sort_bitonic.cl")
+        arrays: dict[str, Any] = {"tile_offset": tile_offset, "tile_depth": tile_depth, "tile_pairs": tile_pairs}
         bitonic.fill_tiles(
             items=capacity,
             pair_tile=pair_tile,
             pair_splat=pair_splat,
             pair_count=pair_count,
             depth_key=depth_key,
-            tile_offset=tile_offset,
-            tile_fill=tile_fill,
-            tile_depth=tile_depth,
-            tile_pairs=tile_pairs,
+            tile_pair_count=tile_pair_count,
+            **arrays,
         )
-        bitonic.sort_tiles(groups=tiles, tile_offset=tile_offset, tile_depth=tile_depth, tile_pairs=tile_pairs)
+        groups = tiles + -(-capacity // SORT_CAPACITY)
+        bitonic.sort_tiles(groups=groups, run_pairs=pair_tile, tiles=tiles, **arrays)
+        if capacity > SORT_CAPACITY:
+            bitonic.merge_runs(groups=groups, run_pairs=pair_tile, tiles=tiles, **arrays)
         return tile_offset, tile_pairs
-
-    def _measure_faster_sort(
-        self, splats: Array, footprints: Footprints, band: Band, count: int, limit: int, defines: Defines
-    ) -> Sort:
-        seconds: dict[Sort, float] = {}
-        for sort in ("radix", "bitonic"):
-            tiler = Tiler(self.device, self.workspace, sort)
-            times = []
-            for _ in range(1 + TRIALS):  # the first trial compiles
-                start = time.perf_counter()
-                tiler.build(splats, footprints, band, count, limit, defines)
-                self.device.finish()
-                times.append(time.perf_counter() - start)
-            seconds[sort] = min(times[1:])
-        return min(seconds, key=lambda s: seconds[s])

@@ -139,7 +139,7 @@ class Records:
 KERNELS = {
     "project": "project_forward",
     "pairs": "count_large permute emit_pairs emit_large find_tile_offsets",
-    "sort": "scan_blocks scan_offsets radix_count radix_scatter count_pairs fill_tiles sort_tiles",
+    "sort": "scan_blocks scan_offsets radix_count radix_scatter fill_tiles sort_tiles merge_runs",
     "blend": "blend_forward lay_over sky_forward",
     "loss": (
         "unpack_pixels pixel_loss ssim_maps ssim_gradient sky_matches sky_cover apply_mask "

@@ -77,6 +77,7 @@ def test_case_has_no_edits_due_and_is_timed_after_warm_up(device):
     timed.step(record=True)
     timed.repeat()
     assert len(timed.step_times) == len(timed.mean_step_times) == 1
+    assert timed.launches <= 26 if device.schedule == "simt" else timed.launches > 0
     assert all(len(times) == 1 for times in timed.stages.values())
 
 
@@ -156,6 +157,7 @@ def test_table_of_a_scene_has_a_row_for_each_stage():
         densify=3.0,
         memory=2**24,
         planned=2**25,
+        launches=20,
     )
     earlier = {"stages": {"project": 2.4, "blend": 0.0}, "host": 1.0, "step": 44.0, "densify": 1.0}
     lines = [line.split() for line in table("A", result, earlier).splitlines()]

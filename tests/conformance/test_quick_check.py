@@ -56,7 +56,7 @@ def test_bitonic_is_checked_if_the_run_can_choose_it(monkeypatch, info, empty_ca
 
 
 def test_checks_of_every_run_need_no_bitonic():
-    assert not {"count_pairs", "fill_tiles", "sort_tiles"} & {name for check in ESSENTIAL for name in check.kernels}
+    assert not {"fill_tiles", "sort_tiles", "merge_runs"} & {name for check in ESSENTIAL for name in check.kernels}
 
 
 def test_doctor_deletes_the_record_of_a_faulty_device(monkeypatch, info, empty_cache):

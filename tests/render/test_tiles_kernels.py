@@ -15,6 +15,7 @@ from clsplat.opencl import device as program
 from clsplat.opencl.device import Device
 from clsplat.render.camera import camera_values
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.render.tiles import COUNTING, Band, Footprints
 from clsplat.scene.camera import MAX_SIDE
 from tests.support.deviations import assert_within_bounds
 from tests.support.devices import each_once, on_devices, on_one_setting, product
@@ -174,7 +175,7 @@ def test_miscounted_large_splat_is_blended_once(device, rng, monkeypatch, sort, 
     image, pairs = expected.image.get(), expected.lists.pairs
     sums = rasterizer.pixel_sums(model, expected, gradient).get()[:, :12]
 
-    kernels = device.program("large.cl").kernels
+    kernels = device.program("large.cl", **COUNTING[sort]).kernels
     correct = kernels["count_large"]
 
     def miscount(**values):
@@ -207,6 +208,7 @@ def _emitted(device, frame, box, mask, count):
     first_pair = device.zeros(len(count), np.uint32)
     written = {"first_pair": first_pair, "pair_tile": pair_tile, "pair_splat": pair_splat}
     written["pair_count"] = device.zeros(1, np.uint32)
+    written["tile_pair_count"] = device.zeros(frame.camera.tiles, np.uint32)
     size = {"tile_box": device.upload(box), "tiles_x": frame.camera.tiles_x, "count": len(count)}
     device.program("pairs.cl").emit_pairs(
         items=len(count),
@@ -277,10 +279,30 @@ def test_radix_with_sorted_keys(device, keys):
     assert_within_bounds(check_radix(device, values.astype(np.uint32), 12))
 
 
-# tile lengths around the bitonic group, its powers of two and the capacity of local memory (1024 or 2048)
-LENGTHS = (0, 1, 2, 3, 5, 63, 64, 65, 127, 128, 1023, 1024, 1025, 0, 2047, 2048, 2049, 4097, 300, 0)
+# around the bitonic group and its powers of two, and the number of pairs of a run, SORT_CAPACITY
+LENGTHS = (0, 1, 2, 3, 5, 63, 64, 65, 127, 128, 129, 1023, 1024, 1025, 0, 2047, 2048, 2049, 4095, 4096, 4097, 300, 0)
 
 
 @on_devices("equal_depths", [False, True])
 def test_bitonic_sorts_tiles_of_any_length(device, rng, equal_depths):
     assert_within_bounds(check_bitonic(device, rng, LENGTHS, 50 if equal_depths else 2**31))
+
+
+@pytest.mark.large
+@on_devices("lengths", [[50_000], [1, 50_000, 700, 0, 1025], [0, 3000, 0, 50_000]])
+def test_bitonic_sorts_the_longest_lists(device, rng, lengths):
+    assert_within_bounds(check_bitonic(device, rng, lengths, 20_000))
+
+
+@on_devices("width, height, count, pairs", [(400, 400, 50_000, 150_643), (1920, 1080, 1_000_000, 3_000_000)])
+def test_bitonic_sort_needs_few_launches(device, monkeypatch, width, height, count, pairs):
+    launches = []
+    tiler = make_tiler(device, "bitonic")
+    arrays = [device.zeros(1, np.uint32) for _ in range(4)]
+    monkeypatch.setattr(program.Kernel, "__call__", lambda kernel, **_: launches.append(kernel.label))
+    monkeypatch.setattr(program.Array, "get_item_later", lambda *_: lambda: pairs)
+    band = Band(-(-width // 16), -(-height // 16), 0, -(-height // 16))
+    for _ in range(2):  # the first call allocates memory, and fills it
+        launches.clear()
+        tiler.build(device.empty(1), Footprints(*arrays), band, count, 2**31)
+    assert 8 < len(launches) <= 12

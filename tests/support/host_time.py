@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from clsplat.conformance.bench.cases import SIZES, BenchCase, synthetic, with_near
+from clsplat.conformance.bench.cases import SIZES, BenchCase, synthetic_scene, with_near
 from clsplat.opencl import device as device_module
 from clsplat.opencl.device import Array, Device, cl  # type: ignore[attr-defined]
 from clsplat.photos.photographs import Photograph
@@ -43,7 +43,7 @@ def measure(device: Device, name: str, sort: str) -> str:
     settings = with_near(load("splat", [f"rasterizer.sort={sort}"]).settings, 0.2)
     width, height, count = {**SIZES, "T": (64, 64, 1000)}[name]
     cl.enqueue_nd_range_kernel = lambda *_: None
-    parameters, view = synthetic(width, height, count)
+    parameters, view = synthetic_scene(width, height, count)
     pixels = np.zeros((3, height, width), np.uint8)
     photographs = [Photograph(upload_camera(device, view), device.upload(pixels)) for _ in range(2)]
     Array.get_item_later = lambda *_: lambda: PAIRS[name]  # type: ignore[method-assign]
@@ -71,4 +71,4 @@ def measure(device: Device, name: str, sort: str) -> str:
 if __name__ == "__main__":
     assert device_module.cl is cl
     for scene in PAIRS:
-        print(measure(Device(None, sys.argv[1]), scene, "".join(sys.argv[2:]) or "radix"), flush=True)  # type: ignore[arg-type]
+        print(measure(Device(None, sys.argv[1]), scene, "".join(sys.argv[2:]) or "auto"), flush=True)  # type: ignore[arg-type]

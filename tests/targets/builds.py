@@ -25,12 +25,14 @@ SCHEDULES: tuple[Schedule, ...] = ("simt", "wide")
 SUMS = sorted({kind.pixel_sums for kind in variants(Statistic).values()} - {PIXEL_SUMS})
 BOX = {"PIXEL_BOX": 1}
 BEHIND = {"GRAD_BEHIND": 1}
+COUNT = {"COUNT_TILES": 1}
 SLOTS = {"SH_SLOTS": 1}
 BLEND: list[dict[str, int]] = [*({"PIXEL_SUMS": n} for n in SUMS), BOX, {**BOX, "PIXEL_SUMS": SUMS[-1]}, BEHIND]
 PASSED = {  # what call sites of Device.program add to the tuning; a test holds it against them
     "adam.cl": [BOX, SLOTS],
     "deferred.cl": [SLOTS],
-    "large.cl": [BOX],
+    "large.cl": [BOX, COUNT, {**BOX, **COUNT}],
+    "pairs.cl": [COUNT],
     "poses.cl": [BOX, SLOTS],
     "project.cl": [BOX, SLOTS],
     "blend_simt.cl": BLEND,

@@ -137,6 +137,7 @@ class BenchResult:
     host: float  # time of the step minus that of the device's stages
     memory: int  # bytes on the device, at peak
     planned: int  # bytes, from the memory plan of training
+    launches: int  # kernels in a step
 
 
 class BenchCase:
@@ -173,6 +174,7 @@ class BenchCase:
         self.stages: dict[str, list[float]] = defaultdict(list)
         self.densify_times: list[float] = []
         self.frame: Frame | None = None
+        self.launches = 0
         for _ in range(WARM_UP_STEPS):
             self.step(record=False)
         self.step(record=False, frozen=PARAMETERS)  # writes gradients to memory, as a step with an edit does
@@ -190,6 +192,7 @@ class BenchCase:
         self.device.timings.sampling = False
         self.frame = view.frame
         if record:
+            self.launches = self.device.timings.launches
             self.step_times.append(1e3 * seconds)
             for name, milliseconds in stage_milliseconds(self.device.timings).items():
                 self.stages[name].append(milliseconds)
@@ -219,9 +222,8 @@ class BenchCase:
         step = statistics.median(self.step_times)
         host = step - sum(stages.values())
         steps, densify_ms = statistics.median(self.mean_step_times), statistics.median(self.densify_times[1:])
-        return BenchResult(
-            work, stages, floors(work, peaks), step, steps, densify_ms, host, self.memory, self._planned_bytes()
-        )
+        memory = self.memory, self._planned_bytes()
+        return BenchResult(work, stages, floors(work, peaks), step, steps, densify_ms, host, *memory, self.launches)
 
     def _planned_bytes(self) -> int:
         camera = self.photograph.camera

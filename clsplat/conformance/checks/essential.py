@@ -45,9 +45,12 @@ def sorting(device: Device, rng: np.random.Generator) -> Results:
     yield from tiles.check_radix(device, rng.integers(0, 2**20, 1025).astype(np.uint32), 20)
 
 
-@BITONIC.add("count_pairs", "fill_tiles", "sort_tiles")
+@BITONIC.add("emit_pairs", "emit_large", "count_large", "fill_tiles", "sort_tiles", "merge_runs")
 def sorting_in_tiles(device: Device, rng: np.random.Generator) -> Results:
-    yield from tiles.check_bitonic(device, rng, (0, 1, 65, 300), 50)
+    yield from tiles.check_bitonic(device, rng, (0, 1, 65, 300, 1025), 50)
+    case = random_case(rng, 40, 210, 130)
+    case.parameters["log_scales"][:4] += 1.5
+    yield from tiles.check_list(device, case, "bitonic", "a scene with large Gaussians")
 
 
 @CHECKS.add("pixel_loss", "ssim_maps", "ssim_gradient", "update_gaussians")

@@ -10,11 +10,11 @@ from clsplat.conformance.check import Checks, Deviation, Results, count_true, ma
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
-from clsplat.render.tiles import Sort, Tiler
+from clsplat.render.tiles import SORT_CAPACITY, Sort, Tiler
 from clsplat.render.workspace import Workspace
 
 CHECKS = Checks()
-LENGTHS = (0, 1, 2, 3, 63, 64, 65, 1023, 1024, 1025, 0, 2047, 2048, 2049, 300, 0)  # around the limits of local memory
+LENGTHS = (0, 1, 2, 3, 127, 128, 129, 1023, 1024, 1025, 0, 2047, 2048, 2049, 4097, 300, 0)  # around a run's (common.h)
 # around a team's run (8 * 64) and the shortest run of one item
 COUNTS = (1, 63, 64, 65, 511, 513, 1025, 16385, 40001)
 
@@ -53,14 +53,18 @@ def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, 
     upload = device.upload
     capacity = pairs + 70  # the device reads the number of pairs
     tile_slots, splat_slots = (upload(np.append(array, np.zeros(70, np.uint32))) for array in (pair_tile, pair_splat))
-    pair_count = upload(np.array([pairs], np.uint32))
+    pair_counts = upload(np.array([pairs], np.uint32)), upload(np.array(lengths, np.uint32))
     offsets, sorted_pairs = make_tiler(device, "bitonic")._sort_in_tiles(
-        tile_slots, splat_slots, upload(depth_key), pair_count, capacity, tiles
+        tile_slots, splat_slots, upload(depth_key), *pair_counts, capacity, tiles
     )
     actual = offsets.get()
-    yield match("count_pairs", "offsets of tiles", actual, np.concatenate([[0], np.cumsum(lengths)]))
-    expected = np.lexsort((pair_splat, depth_key, pair_tile))
-    yield match("sort_tiles", f"order of {pairs} pairs in {tiles} tiles", sorted_pairs.get()[:pairs], expected)
+    yield match("scan_offsets", "offsets of tiles", actual, np.concatenate([[0], np.cumsum(lengths)]))
+    yield match("fill_tiles", "pairs that are not in their tile", pair_counts[1].get(), 0)
+    expected, actual = np.lexsort((pair_splat, depth_key, pair_tile)), sorted_pairs.get()[:pairs]
+    is_long = np.repeat(np.array(lengths) > SORT_CAPACITY, lengths)
+    for kernel, mask in (("sort_tiles", ~is_long), ("merge_runs", is_long)):
+        title = f"order of {mask.sum()} of {pairs} pairs in {tiles} tiles"
+        yield match(kernel, title, actual[mask], expected[mask])
 
 
 @CHECKS.add("scan_blocks", "scan_offsets")
@@ -80,7 +84,7 @@ def radix_sort(device: Device, rng: np.random.Generator) -> Results:
         yield from check_radix(device, special_keys.astype(np.uint32), 12)
 
 
-@CHECKS.add("count_pairs", "fill_tiles", "sort_tiles")
+@CHECKS.add("fill_tiles", "sort_tiles", "merge_runs")
 def bitonic_sort(device: Device, rng: np.random.Generator) -> Results:
     for max_key in (50, 2**31):
         yield from check_bitonic(device, rng, LENGTHS, max_key)
@@ -104,7 +108,7 @@ def check_list(device: Device, case: Case, sort: Sort, label: str) -> Results:
     keys = rasterizer.workspace.array("depth_key", count, np.uint32).get()
     splats, offsets = lists.pair_splat.get()[: lists.pairs], lists.tile_offset.get()[: tiles + 1]
     tile_splats = splats[np.minimum(lists.tile_pairs.get()[: lists.pairs], max(lists.pairs, 1) - 1)]
-    kernel = "find_tile_offsets" if sort == "radix" else "count_pairs"
+    kernel = "find_tile_offsets" if sort == "radix" else "fill_tiles"
     yield count_true(kernel, f"offsets of tiles, {label}", np.diff(offsets.astype(np.int64), append=lists.pairs) < 0)
     tile = np.repeat(np.arange(tiles), np.maximum(np.diff(offsets.astype(np.int64)), 0))[: lists.pairs]
     if len(tile) < lists.pairs:
@@ -206,6 +210,7 @@ def check_wrong_counts(device: Device, case: Case) -> Results:
             pair_count=device.upload(offsets[-1:].astype(np.uint32)),
             pair_tile=arrays[0],
             pair_splat=arrays[1],
+            tile_pair_count=device.zeros(camera.tiles, np.uint32),
             tiles_x=camera.tiles_x,
             row_begin=0,
             row_end=camera.tiles_y,

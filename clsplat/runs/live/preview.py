@@ -150,8 +150,7 @@ class Preview:
             raise MemoryLimitError("training leaves no device memory for previews")
         if self._rasterizer is None:
             limits = Limits(min(MAX_PAIRS, training.budget.pairs), training.budget.tiles)
-            sort = training.tiler.sort
-            self._rasterizer = Rasterizer(device, "radix" if sort == "auto" else sort, limits)
+            self._rasterizer = Rasterizer(device, training.tiler.sort, limits)
             self._costs.clear()
         return self._rasterizer
 

@@ -58,8 +58,7 @@ class Distractors(TrainingModule):
     """Weight of the loss on the mean alpha of these Gaussians over the photo; may be scheduled."""
 
     def create_state(self, run: Run) -> "DistractorsState":
-        sort, budget = run.rasterizer.tiler.sort, run.rasterizer.budget
-        rasterizer = Rasterizer(run.device, "radix" if sort == "auto" else sort, budget)
+        rasterizer = Rasterizer(run.device, run.rasterizer.tiler.sort, run.rasterizer.budget)
         return DistractorsState(self, run.scene.split("train"), rasterizer)
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
