@@ -29,8 +29,8 @@ class Case:
     view: View
     degree: int = 3
     near: float = 0.2
-    variance: float = 0.3
-    compensate: float = 0.0
+    variance: float = 0.3  # px², of the screen filter
+    compensate: float = 0.0  # 1: the screen filter preserves the brightness of small splats
     pixel_box: float = 0.0  # 1: the box filter, with a variance of 0
     dropout: DropoutMask | None = None
 
@@ -153,16 +153,16 @@ def safe_case(
 Floats = NDArray[Any]
 
 
-def sums_to_gradients(splats: Splats, m: Floats) -> tuple[Floats, Floats]:
+def sums_to_gradients(splats: Splats, sums: Floats) -> tuple[Floats, Floats]:
     """Convert sums over pixels, [N, PIXEL_SUMS], to dL/d(mean2d), [N, 2], and dL/d(conic), [N, 3].
 
     See cl_kernels/splat.h and pixel_box.h.  The sums of culled splats are 0.
     """
     if splats.pixel_box:
-        return m[:, 1:3], _covariance_gradient(splats, m[:, 3:6])
+        return sums[:, 1:3], _covariance_gradient(splats, sums[:, 3:6])
     a, b, c = splats.conic.T
-    mean2d = -np.stack([a * m[:, 1] + b * m[:, 2], b * m[:, 1] + c * m[:, 2]], axis=1)
-    return mean2d, np.stack([-0.5 * m[:, 3], -m[:, 4], -0.5 * m[:, 5]], axis=1)
+    mean2d = -np.stack([a * sums[:, 1] + b * sums[:, 2], b * sums[:, 1] + c * sums[:, 2]], axis=1)
+    return mean2d, np.stack([-0.5 * sums[:, 3], -sums[:, 4], -0.5 * sums[:, 5]], axis=1)
 
 
 def gradients_to_sums(splats: Splats, gradients: ref.SplatGradients) -> Floats:
@@ -185,19 +185,19 @@ def gradients_to_sums(splats: Splats, gradients: ref.SplatGradients) -> Floats:
     return np.concatenate([power, position, second_order, gradients.color], axis=1) * splats.visible[:, None]
 
 
-def _covariance_gradient(splats: Splats, m: Floats) -> Floats:
+def _covariance_gradient(splats: Splats, sums: Floats) -> Floats:
     """Return dL/d(xx, xy, yy), [N, 3], from gradients of k = xy / yy, ln s and ln t, [N, 3].
 
     s² = yy and t² = xx - xy² / yy.  If xx > yy, x and y are swapped.
     """
-    gradient = np.zeros((len(m), 3))
+    gradient = np.zeros((len(sums), 3))
     for n in np.flatnonzero(splats.visible):
         xx, xy, yy = splats.conic[n]
         is_swapped = xx > yy
         if is_swapped:
             xx, yy = yy, xx
         k, t2 = xy / yy, xx - xy * xy / yy
-        grad_k, grad_s, grad_t = m[n]
+        grad_k, grad_s, grad_t = sums[n]
         grad_t2 = grad_t / (2 * t2)
         grad_yy = -grad_k * k / yy + grad_s / (2 * yy) + grad_t2 * k * k
         gradient[n] = grad_t2, grad_k / yy - 2 * k * grad_t2, grad_yy

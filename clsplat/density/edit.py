@@ -186,10 +186,10 @@ class Edit:
         self.gaussians.set_rows(name, rows, values)
 
     def set_children(self, name: str, rows: NDArray[np.integer], values: NDArray[np.floating]) -> None:
-        """Set the values of a table, [n, copies, components], for the new rows of distinct Gaussians, [n].
+        """Set the values of a table for the rows that replace some Gaussians.
 
-        copies: number of rows that replace each Gaussian.  If the growth of a Gaussian is undone later, its values do
-        not change.
+        rows: distinct Gaussians, [n].  values: [n, copies, components], for `copies` rows per Gaussian; ignored for a
+        Gaussian whose growth is undone later.
         Raises ValueError for invalid rows (see `check_rows`) and for values of a wrong shape.
         """
         components = self.gaussians.tables[name].components

@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 from clsplat.core.schedule import Positive
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.survey import SQUARE, WEIGHT, RenderedView
-from clsplat.density.thresholds import Share
+from clsplat.density.thresholds import UnitInterval
 from clsplat.formats.splats import inverse_opacities
 
 Score = Literal["weight", "sensitivity"]
@@ -44,9 +44,12 @@ def weights(
 
 
 def select_by_weight(weight: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
-    """Return the mask, [N], of the smallest set of Gaussians of nonzero weight with `fraction` of the total weight."""
+    """Return the mask, [N], of the heaviest Gaussians that together have at least `fraction` of the total weight.
+
+    Gaussians of weight 0 are not selected.
+    """
     order = np.argsort(-weight, kind="stable")
-    preceding_sum = np.cumsum(weight[order]) - weight[order]  # of all larger weights
+    preceding_sum = np.cumsum(weight[order]) - weight[order]  # sum of all larger weights
     mask = np.zeros(len(weight), bool)
     mask[order] = (preceding_sum < fraction * weight.sum()) & (weight[order] > 0)
     return mask
@@ -105,7 +108,7 @@ class SampledPruning(Rule):
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"share", "opacity_below", "size_above"})
 
-    share: Share = 0.5
+    share: UnitInterval = 0.5
     """Fraction of the faint and the large Gaussians to remove."""
     opacity_below: Positive = 0.005
     """Opacity below which a Gaussian is faint; may be scheduled."""

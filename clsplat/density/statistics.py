@@ -86,7 +86,7 @@ class ScreenGradAbsSum(Statistic):
 class Texture(Statistic):
     """Mean gradient magnitude of the photographs under the splat, per px: Σ α T |∇I| / Σ α T over all pixels and views.
 
-    Masked pixels do not count.
+    Masked pixels are ignored.
     """
 
     type: Literal["texture"] = "texture"

@@ -27,7 +27,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class RenderedView:
-    """A rendered view, valid until the next one is rendered.  Masked pixels do not count."""
+    """A rendered view, valid until the next one is rendered.  Masked pixels are ignored."""
 
     rasterizer: Rasterizer
     model: DeviceModel
@@ -49,7 +49,7 @@ class RenderedView:
         return (cls.render(rasterizer, model, photograph, background) for photograph in photographs)
 
     def counted_pixels(self) -> NDArray[np.bool_]:
-        """Return the mask of the pixels that count, [height, width]."""
+        """Return the mask of the unmasked pixels, [height, width]."""
         camera, mask = self.photograph.camera, self.photograph.unmasked_pixels()
         return np.ones((camera.height, camera.width), bool) if mask is None else mask
 
@@ -79,9 +79,9 @@ class RenderedView:
         channel: index of the image channel whose sum over the image is the loss to differentiate; None for no loss.
         """
         camera, counted_mask = self.photograph.camera, self.counted_pixels()
-        texture = np.full((camera.rows, camera.stride), -1, np.float32)  # -1: the pixel does not count
+        texture = np.full((camera.rows, camera.stride), -1, np.float32)  # -1: the pixel is ignored
         texture[: camera.height, : camera.width] = np.where(counted_mask, 0 if plane is None else plane, -1)
-        texture_array = self._workspace.array("surveyed texture", texture.shape)
+        texture_array = self._workspace.array("survey texture", texture.shape)
         texture_array.set(texture)
         gradient = self._gradient()
         if channel is None:

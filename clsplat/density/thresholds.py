@@ -10,13 +10,13 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import NonNegative, explain_schedule
 from clsplat.core.settings import Settings
 
-Share = Annotated[float, Field(ge=0, le=1)]
+UnitInterval = Annotated[float, Field(ge=0, le=1)]
 
 
 class Quantile(Settings):
     """The quantile of a statistic over the Gaussians."""
 
-    quantile: Share
+    quantile: UnitInterval
     """Fraction of the Gaussians that are below the threshold."""
     of: Literal["gaussians"] = "gaussians"
     """Take the quantile over the Gaussians."""
@@ -25,7 +25,7 @@ class Quantile(Settings):
 class PixelQuantile(Settings):
     """The quantile of the texture, per px, over the pixels of the training photographs."""
 
-    quantile: Share
+    quantile: UnitInterval
     """Fraction of the pixels that are below the threshold."""
     of: Literal["pixels"]
     """Take the quantile over the photos' pixels."""

@@ -12,8 +12,8 @@ from clsplat.render.rasterizer import Content
 
 
 class InverseDepth(ImageLoss):
-    """Mean over a photograph's points of q |D - 1/z|, times the scene's extent, where z is the depth of a point and D
-    the blended inverse depth of its pixel, the sum of weight / depth over splats.
+    """Mean over a photograph's points of q |D - 1/z|, times the scene's extent, with z the depth of a point, and
+    D the blended inverse depth of its pixel: the sum of weight / depth over splats.
 
     q is 1 for points in at least four photographs, less for others, and 0 in photographs with a reprojection error of a
     pixel or more at training size, if the dataset has such errors.  The background does not add to D, so splats also

@@ -25,7 +25,7 @@ class HostLoss(ImageLoss):
     _function: HostFunction = PrivateAttr()
 
     def __init__(self, function: HostFunction, weight: Schedule = 1.0) -> None:
-        """Raises ConfigError if the weight is not a schedule of nonnegative numbers."""
+        """Wrap a function.  Raises ConfigError if the weight is not a schedule of nonnegative numbers."""
         try:
             super().__init__(weight=weight.item() if isinstance(weight, np.generic) else weight)
         except ValidationError as error:

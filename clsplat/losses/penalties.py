@@ -37,7 +37,7 @@ class CovarianceTrace(Penalty):
         weight = at_step(self.weight, inputs.step) / max(1, gaussians.count) / inputs.extent**2
         gaussians.device.program("penalty.cl").covariance_trace(
             **inputs.arguments("log_scales"),
-            nearest2=gaussians[INTERVAL2] if self.pixels else gaussians["filter_variance"],  # or any table: times 0
+            nearest2=gaussians[INTERVAL2] if self.pixels else gaussians["filter_variance"],  # any: times 0
             sums=sums,
             above=0.0 if self.pixels else self.above * inputs.extent**2,
             pixels2=3.0 * (self.pixels or 0.0) ** 2,
@@ -84,6 +84,6 @@ class MeanOpacity(Penalty):
         gaussians, sums = inputs.gaussians, inputs.sums("mean_opacity")
         weight = at_step(self.weight, inputs.step) / max(1, gaussians.count)
         arguments = inputs.arguments("logit_opacity")
-        del arguments["stride"]  # of one plane
+        del arguments["stride"]  # not needed, since the table has one component
         gaussians.device.program("penalty.cl").mean_opacity(**arguments, sums=sums, weight=weight)
         return LossValue("mean_opacity", lambda: weight * float(sums.get().sum(dtype=np.float64)))

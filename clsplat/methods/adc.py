@@ -56,7 +56,7 @@ class Clone(Grow):
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_below"})
 
     size_below: Positive = 0.01
-    """Largest size of a Gaussian that is cloned: largest standard deviation as a fraction of the scene extent."""
+    """Size up to which a Gaussian is cloned: largest standard deviation as a fraction of the scene extent."""
 
     def mark(self, edit: Edit) -> None:
         edit.mark(copies=2, old_rows=1, size_below=edit.at(self.size_below), **self.condition(edit))
@@ -69,7 +69,7 @@ class SplitLarge(Grow):
     training_keys: ClassVar[frozenset[str]] = frozenset({"size_above", "children", "shrink"})
 
     size_above: Positive = 0.01
-    """Smallest size of a Gaussian that is split: largest standard deviation as a fraction of the scene extent."""
+    """Size from which a Gaussian is split: largest standard deviation as a fraction of the scene extent."""
     children: Annotated[int, Field(ge=2, le=8)] = 2
     """Number of Gaussians that replace one."""
     shrink: Annotated[float, Field(ge=1)] = 1.6

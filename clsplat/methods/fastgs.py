@@ -11,7 +11,7 @@ from clsplat.core.schedule import NonNegative
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import SampledPruning
 from clsplat.density.survey import BLENDED, LOSSES, Survey, normalize
-from clsplat.density.thresholds import Share
+from clsplat.density.thresholds import UnitInterval
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class WrongPixelsRule(Rule):
 
     views: Annotated[int, Field(ge=1)] = 10
     """Number of training views, sampled by seed and step; all if there are fewer."""
-    error_above: Share = 0.1
+    error_above: UnitInterval = 0.1
     """Error above which a pixel is wrong: mean over channels, scaled to [0, 1] in each view."""
 
     def count_wrong_pixels(self, edit: Edit) -> WrongPixels:
@@ -85,7 +85,7 @@ class PruneInaccurate(WrongPixelsRule):
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"score_above"})
 
-    score_above: Share = 0.9
+    score_above: UnitInterval = 0.9
     """Score above which a Gaussian is removed."""
 
     def mark(self, edit: Edit) -> None:

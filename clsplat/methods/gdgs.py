@@ -28,9 +28,9 @@ class CloneDense(Rule):
     )
 
     gradient_above: Positive = 2.0e-4
-    """Smallest mean of `screen_grad` of a Gaussian that is copied."""
+    """Smallest mean of `screen_grad` at which a Gaussian is copied."""
     size_below: Positive = 0.01
-    """Largest size of a Gaussian that is copied: largest standard deviation as a fraction of the scene extent."""
+    """Size up to which a Gaussian is copied: largest standard deviation as a fraction of the scene extent."""
     ratio_above: NonNegative = 400.0
     """Smallest ratio of the counts in the fullest cells to those in the emptiest."""
     jitter: NonNegative = 0.5

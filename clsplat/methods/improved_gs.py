@@ -18,7 +18,7 @@ from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import sampling_order, select_largest
 from clsplat.density.statistics import TEXTURE
 from clsplat.density.survey import RenderedView, Survey, normalize
-from clsplat.density.thresholds import Share
+from clsplat.density.thresholds import UnitInterval
 
 Floats = NDArray[np.float64]
 
@@ -50,7 +50,7 @@ class SplitLongAxis(Rule):
     )
 
     gradient_above: Positive = 3.0e-4
-    """Smallest mean of `screen_grad_abs` of a Gaussian that is split."""
+    """Smallest mean of `screen_grad_abs` at which a Gaussian is split."""
     views: Annotated[int, Field(ge=1)] = 10
     """Number of training views for the score, sampled by seed and step; all if there are fewer."""
     distance: Positive = 1.35
@@ -100,7 +100,7 @@ class PruneLowestOpacity(Rule):
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
 
-    share: Share = 0.2
+    share: UnitInterval = 0.2
     """Fraction of the Gaussians that is removed."""
 
     def mark(self, edit: Edit) -> None:

@@ -16,7 +16,7 @@ from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import select_largest
 from clsplat.density.mixture import masses, merge
 from clsplat.density.statistics import SEEN, Statistic, StatisticName
-from clsplat.density.thresholds import PixelQuantile, Quantile, Share, Threshold
+from clsplat.density.thresholds import PixelQuantile, Quantile, Threshold, UnitInterval
 from clsplat.formats.splats import SH_C0, inverse_opacities
 from clsplat.gaussians.gaussians import INTERVAL2, Gaussians
 from clsplat.losses.base import ViewGradients
@@ -56,10 +56,10 @@ class Subdivide(Rule):
     """Number of Gaussians that replace one."""
     beta: Annotated[float, Field(gt=0, le=1)] = BETA
     """A child's covariance divided by its parent's."""
-    max_fraction: Share = 0.05
+    max_fraction: UnitInterval = 0.05
     """Largest fraction of all Gaussians that one edit splits, starting with the largest scores."""
     radius_above: Annotated[float, Field(ge=0)] = 2.0
-    """Smallest mean radius on the screen of a Gaussian that is split: three standard deviations, px."""
+    """Smallest mean radius on the screen at which a Gaussian is split: three standard deviations, px."""
 
     @property
     def statistics(self) -> set[str]:
@@ -88,9 +88,9 @@ class SplitTextured(Subdivide):
     texture: StatisticName = "texture"
     """Statistic whose mean is the texture."""
     texture_above: Threshold = PixelQuantile(quantile=0.8, of="pixels")
-    """Smallest texture of a Gaussian that is split: a number, or a quantile."""
+    """Smallest texture at which a Gaussian is split: a number, or a quantile."""
     gradient_above: NonNegative = 1.0e-4
-    """Smallest mean of `screen_grad` of a Gaussian that is split."""
+    """Smallest mean of `screen_grad` at which a Gaussian is split."""
 
     @property
     def statistics(self) -> set[str]:
@@ -149,7 +149,7 @@ class PruneUnimportant(Rule):
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"share"})
 
-    share: Share = 0.05
+    share: UnitInterval = 0.05
     """Fraction of all Gaussians to remove."""
 
     def mark(self, edit: Edit) -> None:

@@ -13,7 +13,7 @@ from pydantic import Field
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import Weights, select_by_weight, weights
 from clsplat.density.survey import WEIGHT, Survey
-from clsplat.density.thresholds import Share
+from clsplat.density.thresholds import UnitInterval
 from clsplat.gaussians.gaussians import HIDDEN, HIDDEN_VIEWS, hide
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled
@@ -53,13 +53,13 @@ class PruneUseless(Rule):
     grows: ClassVar[bool] = False
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight_per_view", "weight_total", "views", "views_below"})
 
-    weight_per_view: Share = 0.99
+    weight_per_view: UnitInterval = 0.99
     """Fraction of a view's weight that its useful Gaussians make up."""
     views: Annotated[int, Field(ge=1)] | None = None
     """Number of training views, sampled by seed and step; default: all."""
     views_below: Annotated[int, Field(ge=0)] = 2
     """Gaussians that are useful in fewer views are removed."""
-    weight_total: Share = 0.999
+    weight_total: UnitInterval = 0.999
     """Fraction of the weight in all views that is kept; the smallest weights are removed."""
 
     def mark(self, edit: Edit) -> None:
@@ -82,7 +82,7 @@ class HideUseless(Scheduled):
     training_keys: ClassVar[frozenset[str]] = frozenset({"weight_per_view"})
     edits: ClassVar[bool] = True
 
-    weight_per_view: Share = 0.99
+    weight_per_view: UnitInterval = 0.99
     """Fraction of a view's weight that its visible Gaussians make up."""
 
     def attach(self, run: Run) -> None:

@@ -26,6 +26,6 @@ class OpacityPressure(Penalty):
         is_active = gaussians.count > self.gaussians
         weight = at_step(self.weight, inputs.step) / max(1, gaussians.count) if is_active else 0.0
         arguments = inputs.arguments("logit_opacity")
-        del arguments["stride"]  # of one plane
+        del arguments["stride"]  # not needed, since the table has one component
         gaussians.device.program("penalty.cl").opacity_pressure(**arguments, sums=sums, low=self.floor, weight=weight)
         return LossValue("opacity_pressure", lambda: weight * float(sums.get().sum(dtype=np.float64)))

@@ -63,8 +63,8 @@ class SplitSteepest(Rule):
     eigenvalue_below: Schedule = -1.0e-6
     """Eigenvalue below which a Gaussian is split, extents⁻²."""
     gradient_above: NonNegative = 2.0e-4
-    """Smallest mean of `screen_grad` of a Gaussian that is split.  Almost all matrices have a negative eigenvalue, so 0
-    splits most Gaussians."""
+    """Smallest mean of `screen_grad` at which a Gaussian is split.  Almost all matrices have a negative eigenvalue, so
+    0 splits most Gaussians."""
     distance: Positive = 0.5
     """Offset of each child, in standard deviations of the Gaussian in that direction."""
     shrink: Annotated[float, Field(ge=1)] = 1.6

@@ -76,11 +76,11 @@ class FlickerMeter:
 
     def add(self, view: View, rendered: Image, photograph: Image, unmasked: Mask | None) -> dict[str, float]:
         """Add a view's 8-bit images, [H, W, 3]; return the PSNR of its static pixels if a file marks these."""
-        static = static_pixels(view)
-        mask = static if unmasked is None else unmasked if static is None else static & unmasked
+        static_mask = static_pixels(view)
+        mask = static_mask if unmasked is None else unmasked if static_mask is None else static_mask & unmasked
         if view.time is not None:
-            self._gather(view, rendered, photograph, mask, static is not None)
-        if static is None or mask is None or not mask.any():
+            self._gather(view, rendered, photograph, mask, static_mask is not None)
+        if static_mask is None or mask is None or not mask.any():
             return {}
         return {STATIC: psnr(rendered, photograph, mask)}
 
@@ -101,12 +101,12 @@ class FlickerMeter:
             if camera.renders.count < MIN_TIMESTAMPS:
                 continue
             render_std, photo_std = camera.renders.deviation(), camera.photographs.deviation()
-            static = np.ones(render_std.shape[:2], bool) if camera.static_mask is None else camera.static_mask
+            mask = np.ones(render_std.shape[:2], bool) if camera.static_mask is None else camera.static_mask
             if not camera.has_static_file:
-                static = static & (photo_std.max(axis=2) <= MAX_NOISE)
-            if static.any():
-                values = {FLICKER: float(render_std[static].mean()), PHOTO_FLICKER: float(photo_std[static].mean())}
-                flicker |= {name: {**values, STATIC_FRACTION: float(static.mean())} for name in camera.views}
+                mask = mask & (photo_std.max(axis=2) <= MAX_NOISE)
+            if mask.any():
+                values = {FLICKER: float(render_std[mask].mean()), PHOTO_FLICKER: float(photo_std[mask].mean())}
+                flicker |= {name: {**values, STATIC_FRACTION: float(mask.mean())} for name in camera.views}
         return flicker
 
 

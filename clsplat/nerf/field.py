@@ -124,7 +124,7 @@ class RayRenderer:
         """
         rays, tiles = level.rays, level.raw_colors.shape[0]
         grad_colors, grad_densities = (
-            self.workspace.array(f"field by {name}", (tiles, COLOR_ROWS, SAMPLES)) for name in ("colors", "densities")
+            self.workspace.array(f"field grad_{name}", (tiles, COLOR_ROWS, SAMPLES)) for name in ("colors", "densities")
         )
         camera = rays.camera
         self._composite.composite_backward(
@@ -203,7 +203,8 @@ class RayRenderer:
         self.encoding.forward(parameters, Samples(rays.cones, edges))
         raw_colors, raw_densities = self.network.forward(parameters, tiles)
         weights, transmittances = (
-            self.workspace.array(f"field {name} {kind}", (rays.count, samples)) for kind in ("weights", "left")
+            self.workspace.array(f"field {name} {table}", (rays.count, samples))
+            for table in ("weights", "transmittances")
         )
         colors = self.workspace.array(f"field {name} rays", (rays.count, 3))
         self._composite.composite_forward(
@@ -275,7 +276,7 @@ class Field:
         return Layers(rgb, alpha.reshape(size), depths.reshape(size) if depth else None)
 
     def _empty(self, camera: DeviceCamera) -> Array:
-        image = self.workspace.array("field picture", (3, camera.rows, camera.stride))
+        image = self.workspace.array("field image", (3, camera.rows, camera.stride))
         image.fill(0)
         return image
 

@@ -56,8 +56,10 @@ class FieldModel:
     origin: NDArray[np.floating] = field(default_factory=lambda: np.zeros(3))  # [3] world coordinates of its origin
 
     def __post_init__(self) -> None:
-        if self.parameters.shape != (self.shape.parameters,):
-            raise ValueError(f"its parameters have shape {self.parameters.shape}; expected ({self.shape.parameters},)")
+        if self.parameters.shape != (self.shape.table_length,):
+            raise ValueError(
+                f"its parameters have shape {self.parameters.shape}; expected ({self.shape.table_length},)"
+            )
         _ = self.shape.scene_units
         if self.origin.shape != (3,):
             raise ValueError(f"its origin has {len(self.origin)} numbers; expected 3")
@@ -137,8 +139,8 @@ def _parse_field(notes: Mapping[str, Any], arrays: archive.Arrays) -> FieldModel
     if arrays.keys() != {PARAMETERS}:
         raise DataError(f"expected only the array '{PARAMETERS}'")
     table = arrays[PARAMETERS]
-    if table.dtype != np.float32 or table.shape != (meta.shape.parameters, 1):
-        raise DataError(f"{PARAMETERS} are not [{meta.shape.parameters}, 1] float32")
+    if table.dtype != np.float32 or table.shape != (meta.shape.table_length, 1):
+        raise DataError(f"{PARAMETERS} are not [{meta.shape.table_length}, 1] float32")
     if not np.isfinite(table).all():
         raise DataError(f"{PARAMETERS} contain values that are not finite")
     rendering, origin = Rendering(background=meta.background, alpha=meta.alpha), np.array(meta.origin or np.zeros(3))

@@ -72,15 +72,16 @@ class Network:
         return colors, densities
 
     def backward(self, parameters: Array, grad_colors: Array, grad_densities: Array, gradient: Array) -> Array:
-        """Add the gradient of the parameters to `gradient`, [P], from the gradients of the last outputs.
+        """Add the gradient of the parameters to `gradient`, [P], from the gradients of the outputs of the last
+        `forward`.
 
         Returns the gradient of the grid's features, [tiles, grid_rows, SAMPLES], valid until the next call.
         """
         tiles, width = grad_colors.shape[0], self.shape.width
         last, direction = _Table(self._trunk_outputs(self.shape.depth - 1, tiles)), _Table(self.direction(tiles)[0])
         color_input = _Table(self._table("conditioned", tiles, self.shape.color_width))
-        grad_color_input = self._table("by conditioned", tiles, self.shape.color_width)
-        grad_direction, grad_x = self._table("by direction", tiles, width), self._table("by hidden", tiles, width)
+        grad_color_input = self._table("grad_conditioned", tiles, self.shape.color_width)
+        grad_direction, grad_x = self._table("grad_direction", tiles, width), self._table("grad_hidden", tiles, width)
         self._sum(self._color, color_input, grad_colors)
         self._differentiate(self._color, parameters, grad_colors, color_input, grad_color_input, RELU)
         self._sum(self._condition, direction, grad_color_input)
@@ -94,12 +95,12 @@ class Network:
             self._sum(layer, inputs, grad_x)
             if i - 1 == self.shape.skip:
                 self._grid_gradient(layer, parameters, grad_x, self.shape.width, add=0)
-            grad_inputs = self._table(f"by hidden {i % 2}", tiles, width)
+            grad_inputs = self._table(f"grad_hidden {i % 2}", tiles, width)
             self._differentiate(layer, parameters, grad_x, inputs, grad_inputs, RELU)
             grad_x = grad_inputs
         self._sum(self._first, _Table(*self.position(tiles)), grad_x)
         grad_grid = self._grid_gradient(self._first, parameters, grad_x, 0, add=int(self.shape.skip is not None))
-        count = self.shape.network_parameters
+        count = self.shape.network_length
         self._program.dense_sums(
             items=count // int(self.workspace.device.tuning["LANES"]),
             partials=self._partials(tiles),
@@ -112,7 +113,7 @@ class Network:
     def _grid_gradient(self, layer: DenseLayer, parameters: Array, grad_outputs: Array, row: int, add: int) -> Array:
         """Compute the gradient of the grid's features, which are a layer's inputs from `row` on."""
         tiles = grad_outputs.shape[0]
-        position, grad_grid = _Table(*self.position(tiles)), self._table("by grid", tiles, self.shape.grid_rows)
+        position, grad_grid = _Table(*self.position(tiles)), self._table("grad_grid", tiles, self.shape.grid_rows)
         self._differentiate(layer, parameters, grad_outputs, position, grad_grid, NO_LIMIT, add, row)
         return grad_grid
 
@@ -125,8 +126,8 @@ class Network:
         return self.workspace.array(f"field {name}", (tiles, rows, SAMPLES))
 
     def _partials(self, tiles: int) -> Array:
-        """Return the array of partial sums, [chunks, network_parameters].  The padding is zero."""
-        return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.network_parameters))
+        """Return the array of partial sums, [chunks, network_length].  The padding is zero."""
+        return self.workspace.array("field partials", (-(-tiles // CHUNK), self.shape.network_length))
 
     def _apply(self, layer: DenseLayer, parameters: Array, inputs: _Table, outputs: Array, lower_bound: float) -> None:
         tiles = outputs.shape[0]
@@ -185,7 +186,7 @@ class Network:
         arguments: dict[str, Any] = {
             "grad_outputs": grad_outputs,
             "partials": self._partials(tiles),
-            "parameter_count": self.shape.network_parameters,
+            "parameter_count": self.shape.network_length,
             "output_rows": output_rows,
             "output_count": layer.columns,
             "tiles": tiles,
@@ -288,7 +289,7 @@ class Encoding:
             levels=self._levels,
             grad_features=grad_position,
             gradient=gradient,
-            first_parameter=self.shape.network_parameters,
+            first_parameter=self.shape.network_length,
             rows=rows,
             parts=self.parts,
             samples=tiles * SAMPLES,
@@ -310,7 +311,7 @@ class Encoding:
             levels=self._levels,
             parameters=parameters,
             features=features,
-            first_parameter=self.shape.network_parameters,
+            first_parameter=self.shape.network_length,
             rows=features.shape[1],
             first_row=first,
             samples=tiles * SAMPLES,

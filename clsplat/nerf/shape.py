@@ -124,7 +124,7 @@ class FieldShape(Settings):
     """The unit of all lengths in the field, in scene units; `auto`: the median distance of the training cameras from
     the point that they look at, divided by 4.03, so that it is 1 for the Blender scenes.  A run writes this length."""
     unit_auto: UnitLength | None = None
-    """Written by a run: the length that `auto` chose.  While `unit` equals it, other photos lead to a new choice."""
+    """Written by a run: the length that `auto` chose.  If `unit` still equals it, other photos change both."""
     near: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 2.0
     """Depth at which the samples of a ray start, in units of `unit`; 2 for the Blender scenes."""
     far: Annotated[float, Field(gt=0, le=FARTHEST)] = 6.0
@@ -212,14 +212,14 @@ class FieldShape(Settings):
         return layers
 
     @property
-    def network_parameters(self) -> int:
-        """The number of parameters of all layers, rounded up to full lines.  The grid's entries follow."""
+    def network_length(self) -> int:
+        """The length of the table of all layers' parameters, rounded up to full lines.  The grid's entries follow."""
         return -(-self.layers[-1].end // LINE) * LINE
 
     @property
-    def parameters(self) -> int:
+    def table_length(self) -> int:
         """The length of the table of parameters, rounded up to full lines."""
-        return self.network_parameters + (-(-self.grid.parameter_count // LINE) * LINE if self.grid else 0)
+        return self.network_length + (-(-self.grid.parameter_count // LINE) * LINE if self.grid else 0)
 
     @property
     def parameter_count(self) -> int:
@@ -228,12 +228,12 @@ class FieldShape(Settings):
         return sum((len(layer.inputs) + 1) * layer.outputs for layer in self.layers) + grid_count
 
     def initial_parameters(self, seed: int) -> NDArray[np.float32]:
-        """Return the initial parameters for a seed, [parameters], as in the released code.
+        """Return the initial parameters for a seed, [table_length], as in the released code.
 
         Weights are uniform within sqrt(6 / (inputs + outputs)) (Glorot and Bengio 2010), biases are 0, and a grid's
         entries are close to 0.
         """
-        rng, values = np.random.default_rng([seed, self.parameter_count]), np.zeros(self.parameters, np.float32)
+        rng, values = np.random.default_rng([seed, self.parameter_count]), np.zeros(self.table_length, np.float32)
         for layer in self.layers:
             limit = np.sqrt(6 / (len(layer.inputs) + layer.outputs))
             weights = np.zeros((layer.rows, layer.columns), np.float32)
@@ -241,7 +241,7 @@ class FieldShape(Settings):
             weights[np.ix_(layer.inputs, range(layer.outputs))] = sample
             values[layer.first : layer.first_bias] = weights.ravel()
         if self.grid:
-            entries = values[self.network_parameters : self.network_parameters + self.grid.parameter_count]
+            entries = values[self.network_length : self.network_length + self.grid.parameter_count]
             entries[:] = rng.uniform(-MAX_INITIAL, MAX_INITIAL, len(entries))
         return values
 

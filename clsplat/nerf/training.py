@@ -53,7 +53,7 @@ class LearnedField(TrainedField):
 
     def __init__(self, field: Field) -> None:
         self.field = field
-        device, count = field.parameters.device, field.shape.parameters
+        device, count = field.parameters.device, field.shape.table_length
         self._arrays = dict(zip(TABLES, (field.parameters, device.zeros(count), device.zeros(count)), strict=True))
         self._gradient = device.zeros(count)
         self._program = device.program("dense.cl")
@@ -73,7 +73,7 @@ class LearnedField(TrainedField):
     ) -> Self:
         """Return the field of a checkpoint.  tables: the result of the method `tables`."""
         parsed_shape = _parse_shape(shape)
-        field = cls(Field(parsed_shape, background.device.zeros(parsed_shape.parameters), background))
+        field = cls(Field(parsed_shape, background.device.zeros(parsed_shape.table_length), background))
         for name, array in field._arrays.items():
             array.set(tables[name][:, 0])
         return field
@@ -85,7 +85,7 @@ class LearnedField(TrainedField):
             raise DataError(f"it contains {next(iter(extra_tables))} in addition to a field")
         if tables.keys() != set(TABLES):
             raise DataError(f"its field does not have the tables {', '.join(TABLES)}")
-        parameters = _parse_shape(shape).parameters
+        parameters = _parse_shape(shape).table_length
         for name, table in tables.items():
             if table.dtype != np.float32 or table.shape != (parameters, 1):
                 raise DataError(f"the table '{name}' of its field is not [{parameters}, 1] float32")
@@ -98,7 +98,7 @@ class LearnedField(TrainedField):
         return self.field
 
     @property
-    def parameters(self) -> int:
+    def parameter_count(self) -> int:
         """The number of trained parameters."""
         return self.field.shape.parameter_count
 
@@ -112,7 +112,7 @@ class LearnedField(TrainedField):
 
     def find_nonfinite(self) -> list[str]:
         """Return the names of the tables that contain NaN or infinity."""
-        device, count = self._gradient.device, self.field.shape.parameters
+        device, count = self._gradient.device, self.field.shape.table_length
         counters = {name: device.zeros(1, np.uint32) for name in self._arrays}
         for name, array in self._arrays.items():
             device.program("check.cl").count_not_finite(
@@ -140,7 +140,7 @@ class LearnedField(TrainedField):
     def update(self, gradient: Array, adam: AdamStep, update_number: int) -> None:
         """Update the parameters with Adam and a gradient, [P].  update_number: from 1."""
         self._program.dense_update(
-            items=self.field.shape.parameters // int(self._gradient.device.tuning["LANES"]),
+            items=self.field.shape.table_length // int(self._gradient.device.tuning["LANES"]),
             parameters=self.field.parameters,
             moment1=self._arrays["moment1"],
             moment2=self._arrays["moment2"],
@@ -148,7 +148,7 @@ class LearnedField(TrainedField):
             rate=adam.rate / (1 - self._beta1**update_number),
             correction2=1 / (1 - self._beta2**update_number),
             epsilon=adam.epsilon,
-            count=self.field.shape.parameters,
+            count=self.field.shape.table_length,
         )
 
     def loss(self, coarse_weight: float) -> tuple[float, float]:
@@ -238,7 +238,7 @@ def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
     encoded_rows = shape.position_rows + shape.grid_rows + PLACE_ROWS + shape.direction_rows
     rows = hidden_rows + encoded_rows + shape.width + 2 * shape.color_width + 4 * COLOR_ROWS
     chunks = -(-samples // (SAMPLES * CHUNK))
-    return FieldPlan(4 * shape.parameters, 4 * rows * samples, 4 * chunks * shape.network_parameters, photographs)
+    return FieldPlan(4 * shape.table_length, 4 * rows * samples, 4 * chunks * shape.network_length, photographs)
 
 
 # Check that photos show the cube of a field's grid, since nothing is trained outside it.

@@ -90,7 +90,7 @@ class Timings:
 class Buffer(cl.Buffer):
     """A buffer in device memory that, unlike pyopencl's class, supports weak references."""
 
-    serial: int  # no other buffer has the same
+    serial: int  # number that no other buffer has
     copy: Any  # event of the last copy that nobody waited for
 
 
@@ -102,10 +102,10 @@ class Recording(threading.local):
 
     plan: Any = None
 
-    def spoil(self) -> None:
+    def invalidate(self) -> None:
         """Mark the plan as not replayable, because of a command that is not a launch."""
         if self.plan is not None:
-            self.plan.is_fixed = False
+            self.plan.is_replayable = False
 
 
 class Array:
@@ -123,7 +123,7 @@ class Array:
     def get(self) -> NDArray[Any]:
         """Copy the array to the host, after waiting for the device.  Raises MemoryLimitError, DeviceError."""
         host = np.empty(self.shape, self.dtype)
-        self.device.recording.spoil()
+        self.device.recording.invalidate()
         if host.size:
             with self.device.raising_errors("a copy to the host"):
                 cl.enqueue_copy(self.device.queue, host, self.buffer)
@@ -138,7 +138,7 @@ class Array:
         return self._copy_later(np.empty(self.shape, self.dtype))
 
     def _copy_later(self, host: NDArray[Any], **part: Any) -> Callable[[], NDArray[Any]]:
-        self.device.recording.spoil()
+        self.device.recording.invalidate()
         with self.device.raising_errors("a copy to the host"):
             copy = cl.enqueue_copy(self.device.queue, host, self.buffer, is_blocking=False, **part)
 
@@ -163,7 +163,7 @@ class Array:
         host = np.ascontiguousarray(values, self.dtype)
         if host.shape != self.shape:
             raise ValueError(f"cannot copy an array of shape {host.shape} into a buffer of shape {self.shape}")
-        self.device.recording.spoil()
+        self.device.recording.invalidate()
         if host.size:
             with self.device.raising_errors("a copy to the device"):
                 cl.enqueue_copy(self.device.queue, self.buffer, host)
@@ -171,7 +171,7 @@ class Array:
     def set_later(self, values: NDArray[Any]) -> None:
         """Copy values of the same shape from the host, as `set` does, but enqueue the copy without waiting for it."""
         host = np.array(values, self.dtype).reshape(self.shape)
-        self.device.recording.spoil()
+        self.device.recording.invalidate()
         with self.device.raising_errors("a copy to the device"):
             copy = cl.enqueue_copy(self.device.queue, self.buffer, host, is_blocking=False)
         self.buffer.copy = copy  # pyopencl waits for a copy when its event is deleted
@@ -273,7 +273,7 @@ class Device:
                 "use fewer Gaussians or smaller images"
             ) from error
         buffer.serial = next(_SERIALS)
-        self.recording.spoil()
+        self.recording.invalidate()
         self.allocated += size
         self.peak = max(self.peak, self.allocated)
         weakref.finalize(buffer, self._record_release, size)
@@ -448,7 +448,7 @@ class Kernel:
 
     def __init__(self, device: "Device", label: str, create: Callable[[], Any], arguments: list[Argument]) -> None:
         self.label, self.arguments = label, arguments
-        self.spare: list[Any] = []  # copies of the kernel that no plan uses
+        self.spare_kernels: list[Any] = []  # copies of the kernel that no plan uses
         self._device, self._create = device, create
         self._kernel = kernel = self.take()
         info, cl_device = cl.kernel_work_group_info, device.context.devices[0]
@@ -462,8 +462,8 @@ class Kernel:
 
     def take(self) -> Any:
         """Return a copy of the kernel, whose arguments no other launch sets."""
-        if self.spare:
-            return self.spare.pop()
+        if self.spare_kernels:
+            return self.spare_kernels.pop()
         kernel = self._create()
         kernel.set_scalar_arg_dtypes([None if a.is_pointer else a.dtype for a in self.arguments])
         return kernel

@@ -37,7 +37,7 @@ class Plan:
 
     def __init__(self, device: Device, changes: Mapping[str, Any]) -> None:
         self.launches: list[Launch] = []
-        self.is_fixed = True  # False if the part also copied or allocated memory: it cannot be replayed
+        self.is_replayable = True  # False if the part also copied or allocated memory
         self.result: Any = None
         self._device = device
         self._values = {name: _identity(value) for name, value in changes.items()}
@@ -98,7 +98,7 @@ class Plan:
     def release(self) -> None:
         """Release the kernels for use in later plans, because some runtimes take 0.2 ms to create one."""
         for launch in self.launches:
-            launch.source.spare.append(launch.kernel)
+            launch.source.spare_kernels.append(launch.kernel)
         self.launches = []
 
 
@@ -114,7 +114,7 @@ class Plans:
 
     def __init__(self, device: Device) -> None:
         self._device = device
-        self._plans: dict[Hashable, Plan | None] = {}  # None: seen once
+        self._plans: dict[Hashable, Plan | None] = {}  # None: the part ran once
 
     def clear(self) -> None:
         """Forget all plans."""
@@ -125,10 +125,10 @@ class Plans:
     def run(self, key: Hashable, changes: Mapping[str, Any], launch: Callable[..., T], *inputs: Any) -> T:
         """Return the result of `launch(*inputs)`, or replay its launches and return the result of the recorded run.
 
-        key: identifies the part, and contains all numbers, and all serial numbers of buffers, on which its launches and
-        its result depend.  changes: arguments of its kernels, by name, that may differ in each run.
+        key: identifies the part; it must contain all numbers, and the serial numbers of all buffers, that its launches
+        and its result depend on.  changes: kernel arguments, by name, that may differ from run to run.
         """
-        if self._device.recording.plan is not None:  # inside of a part that is being recorded
+        if self._device.recording.plan is not None:  # inside a part that is being recorded
             return launch(*inputs)
         plan = self._plans.get(key)
         if plan is not None:
@@ -145,14 +145,14 @@ class Plans:
         del self._plans[key]
         plan = self.record(changes, launch, *inputs)
         result = plan.result
-        if plan.is_fixed:
+        if plan.is_replayable:
             self._plans[key] = plan
         else:
             plan.release()
         return result
 
     def record(self, changes: Mapping[str, Any], launch: Callable[..., Any], *inputs: Any) -> Plan:
-        """Run a part and return a plan of it."""
+        """Run a part, and return a plan that replays its launches."""
         plan = self._device.recording.plan = Plan(self._device, changes)
         try:
             plan.result = launch(*inputs)

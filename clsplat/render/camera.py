@@ -39,7 +39,7 @@ class DeviceCamera:
     tile: int
     view_index: int | None = None  # in the table HIDDEN; None renders all Gaussians
     time: float | None = None  # of the scene, in [0, 1], at which moving Gaussians are rendered
-    source: View | None = field(default=None, repr=False, compare=False)  # whose values it has
+    source: View | None = field(default=None, repr=False, compare=False)  # the view that has these values
     values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host
 
     @property

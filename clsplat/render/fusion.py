@@ -41,8 +41,10 @@ def find_blocks(images: Iterable[DepthImage], voxel: float, truncation: float) -
         cells = cells[((cells >= 0) & (cells < 1 << 21)).all(axis=1)]
         keys.append(np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]))
     unique_keys, views = np.unique(np.concatenate(keys), return_counts=True)
-    seen = unique_keys[views >= MIN_VIEWS]
-    return np.stack([(seen >> shift & (1 << 21) - 1) - (1 << 20) for shift in (42, 21, 0)], axis=1).astype(np.int32)
+    keys_seen = unique_keys[views >= MIN_VIEWS]
+    return np.stack([(keys_seen >> shift & (1 << 21) - 1) - (1 << 20) for shift in (42, 21, 0)], axis=1).astype(
+        np.int32
+    )
 
 
 def _unproject(image: DepthImage, truncation: float, reach: float) -> NDArray[np.float64]:

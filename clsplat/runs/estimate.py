@@ -122,7 +122,7 @@ def _field_estimate(training: TrainField, units: int) -> Estimate:
     """Estimate the time of a stage that trains a field.  All its steps take the same time."""
     shape = training.field
     samples = training.rays * (shape.coarse_samples + shape.fine_samples)
-    sample_seconds = WEIGHT * shape.network_parameters + LEVEL * (shape.grid.levels if shape.grid else 0)
+    sample_seconds = WEIGHT * shape.network_length + LEVEL * (shape.grid.levels if shape.grid else 0)
     low = LAUNCHES + samples * sample_seconds / units
     reason = f"{training.steps:,} steps of {_format_ms(low, SLOWER * low)}, of {training.rays:,} rays"
     return Estimate(training.stage, (training.steps * low, training.steps * SLOWER * low), reason)

@@ -43,7 +43,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
         **({"overfit": True} if is_overfit(run) else {}),
         "gaussians": run.gaussians,
         **({"sky_gaussians": sky} if (sky := sky_gaussians(run)) else {}),
-        **({"parameters": run.learned_field.parameters} if run.learned_field else {}),
+        **({"parameters": run.learned_field.parameter_count} if run.learned_field else {}),
         "steps": run.step,
         "train_seconds": round(run.train_seconds, 3),
         "cpu_seconds": round(run.cpu_seconds, 3),

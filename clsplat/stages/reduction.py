@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from clsplat.core.errors import EmptyRegionError
 from clsplat.density.control import Box, keep_rows
 from clsplat.density.importance import SCORES, Score, select_largest
-from clsplat.density.thresholds import Share
+from clsplat.density.thresholds import UnitInterval
 from clsplat.formats.splats import MAX_DEGREE, sh_coefficients
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled, Stage
@@ -117,7 +117,7 @@ class ReduceSh(Scheduled):
 
     degree: Annotated[int, Field(ge=0, le=MAX_DEGREE)] = MAX_DEGREE
     """Highest degree to keep, for all Gaussians."""
-    share: Share = 0
+    share: UnitInterval = 0
     """Fraction of all bands of all Gaussians to set to zero, starting with the least important bands."""
 
     def frozen_parameters(self, run: Run) -> Collection[str]:

@@ -290,7 +290,9 @@ def _headline(run: Run) -> str:
 
 
 def _model_size(run: Run) -> str:
-    return size_text(run.gaussians, run.learned_field.parameters if run.learned_field else None, sky_gaussians(run))
+    return size_text(
+        run.gaussians, run.learned_field.parameter_count if run.learned_field else None, sky_gaussians(run)
+    )
 
 
 def _summary_values(run: Run) -> dict[str, str]:

@@ -86,7 +86,7 @@ class Best(BaseModel):
         """Return a few sentences about the outcome."""
         best, last = self.measured, self.last
         psnrs = f"{best.train:.1f} dB on training views and {best.validation:.1f} dB on validation views"
-        text = f"By the validation views, the model of step {best.step:,} is the best: {psnrs}{best.overfit_text()}."
+        text = f"On the validation views, the model of step {best.step:,} is the best: {psnrs}{best.overfit_text()}."
         if last.step != best.step:
             overfit = last.overfit_text(self.first_overfit)
             text += f" The model of step {last.step:,} has {last.train:.1f} and {last.validation:.1f} dB{overfit}."

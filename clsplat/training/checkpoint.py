@@ -449,7 +449,7 @@ def _write(run: Run, prefix: str) -> Path:
 
 def _field_entry(run: Run) -> dict[str, Any] | None:
     field = run.learned_field
-    return {"kind": field.kind, "shape": field.shape_as_data(), "parameters": field.parameters} if field else None
+    return {"kind": field.kind, "shape": field.shape_as_data(), "parameters": field.parameter_count} if field else None
 
 
 def _record_changes(run: Run, path: Path, state: State) -> list[str]:

@@ -33,7 +33,7 @@ class TrainedField(ABC):
 
     @property
     @abstractmethod
-    def parameters(self) -> int:
+    def parameter_count(self) -> int:
         """The number of trained parameters."""
 
     @abstractmethod

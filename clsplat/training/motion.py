@@ -66,7 +66,7 @@ def update_motion(
 ) -> None:
     """Update the motion of all or only the visible Gaussians with Adam.
 
-    depth_key: depth keys of the view, [S]; rates: from `MotionRates.at`; updates: number of updates with this one;
+    depth_key: depth keys of the view, [S]; rates: from `MotionRates.at`; updates: update count, including this one;
     every: all bits set to update all rows, 0 to update only visible rows.
     """
     table, (moment1, moment2) = gaussians.tables[MOTION], moment_tables(MOTION)

@@ -63,7 +63,7 @@ def differences(
 
 def _item_classes(items: list[Any]) -> dict[str, Any]:
     """Return the settings classes of a list's items, keyed by type; empty unless all items are addressed by type."""
-    classes = {tag[1]: kind for kind in Settings.subclasses if kind.keyed_by_type and (tag := variant_tag(kind))}
+    classes = {tag[1]: cls for cls in Settings.subclasses if cls.keyed_by_type and (tag := variant_tag(cls))}
     types = [str(item.get("type")) if isinstance(item, dict) else "" for item in items]
     return {name: classes[name] for name in types} if all(name in classes for name in types) else {}
 

@@ -85,7 +85,7 @@ def test_grid_parameters_follow_the_networks_and_start_near_zero():
     plain, gridded = (FieldShape(degrees=2, grid=item) for item in (None, GridShape(levels=2, entries=16)))
     assert gridded.position_rows == plain.position_rows + 2 * FEATURES
     first = gridded.initial_parameters(3)
-    own = first[gridded.network_parameters : gridded.network_parameters + gridded.grid.parameter_count]
+    own = first[gridded.network_length : gridded.network_length + gridded.grid.parameter_count]
     assert 0 < np.abs(own).min() < np.abs(own).max() < 1e-4
     assert FieldShape.model_validate(gridded.model_dump()) == gridded
 

@@ -39,7 +39,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory, pipelin
 
 def test_grid_parameters_are_trained(finished):
     field = clsplat.load_field(finished)
-    own = slice(field.shape.network_parameters, field.shape.network_parameters + field.shape.grid.parameter_count)
+    own = slice(field.shape.network_length, field.shape.network_length + field.shape.grid.parameter_count)
     moved = np.abs(field.parameters - field.shape.initial_parameters(0))[own]
     assert 0.05 < (moved > 1e-3).mean() < 0.95  # some lie where no sample is
     assert json.loads((finished / "metrics.json").read_text())["parameters"] == field.shape.parameter_count

@@ -114,7 +114,7 @@ def test_kernels_of_forgotten_plans_are_used_again(device, monkeypatch):
     plans, part, kernel = Plans(device), Fill(device), device.program("fill.cl").fill_words
     created = []
     create = kernel._create
-    monkeypatch.setattr(kernel, "spare", [])
+    monkeypatch.setattr(kernel, "spare_kernels", [])
     monkeypatch.setattr(kernel, "_create", lambda: created.append(create()) or created[-1])
     for key in range(20):
         for _ in range(3):

@@ -156,7 +156,7 @@ def test_invalid_unit_of_a_field_is_refused(unit):
 
 def test_field_file_without_a_unit_is_in_scene_units(tmp_path):
     shape = FieldShape(unit=2.0, depth=1, skip=None, width=4, color_width=4, degrees=1)
-    FieldModel(shape, np.zeros(shape.parameters, np.float32), Rendering()).save(tmp_path / "new.npz")
+    FieldModel(shape, np.zeros(shape.table_length, np.float32), Rendering()).save(tmp_path / "new.npz")
     assert load_field(tmp_path / "new.npz").shape == shape
     notes, arrays = archive.read(tmp_path / "new.npz")
     old = {key: value for key, value in notes["shape"].items() if not key.startswith("unit")}

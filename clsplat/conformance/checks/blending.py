@@ -79,17 +79,17 @@ def sum_pixels(
     return pixel_sums.get()[:, : model.gaussians.count].T.astype(np.float64)
 
 
-def check_sum(case: Case, m: NDArray[Any], weights: NDArray[Any], label: str) -> Results:
+def check_sum(case: Case, sums: NDArray[Any], weights: NDArray[Any], label: str) -> Results:
     """Compare sums over pixels, [N, PIXEL_SUMS or more], after conversion to gradients of splats."""
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
-    mean2d, conic = sums_to_gradients(splats, m)
+    mean2d, conic = sums_to_gradients(splats, sums)
     yield compare(kernel, f"gradients of splat means, {label}", mean2d, truth.mean2d, GRADIENT)
     yield compare(kernel, f"gradients of conics, {label}", conic, truth.conic, GRADIENT)
-    yield compare(kernel, f"gradients of opacities, {label}", m[:, 0], truth.opacity * splats.opacity, GRADIENT)
-    yield compare(kernel, f"gradients of colors, {label}", m[:, 6:9], truth.color, GRADIENT)
-    if m.shape[1] > PIXEL_SUMS:
-        actual = m[:, ABS_X : ABS_X + 2]
+    yield compare(kernel, f"gradients of opacities, {label}", sums[:, 0], truth.opacity * splats.opacity, GRADIENT)
+    yield compare(kernel, f"gradients of colors, {label}", sums[:, 6:9], truth.color, GRADIENT)
+    if sums.shape[1] > PIXEL_SUMS:
+        actual = sums[:, ABS_X : ABS_X + 2]
         yield compare(kernel, f"absolute gradients, {label}", actual, truth.mean2d_abs, GRADIENT)
 
 
@@ -140,14 +140,14 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
     texture = np.where(rng.random((height, width)) < 0.9, rng.uniform(0, 0.5, (height, width)), -1).astype(np.float32)
     yield from check_sum(case, sum_pixels(device, case, weights, ABS_X + 2), weights, "with absolute gradients")
-    m = sum_pixels(device, case, weights, ALL_SUMS, texture=texture)
-    yield from check_sum(case, m, weights, "with weights and texture")
+    sums = sum_pixels(device, case, weights, ALL_SUMS, texture=texture)
+    yield from check_sum(case, sums, weights, "with weights and texture")
     blend_weights = ref.blend_weights(case.project(), width, height) * (texture >= 0)
-    yield compare("blend_backward", "sums of weights", m[:, WEIGHT], blend_weights.sum(axis=(1, 2)), GRADIENT)
+    yield compare("blend_backward", "sums of weights", sums[:, WEIGHT], blend_weights.sum(axis=(1, 2)), GRADIENT)
     expected = (blend_weights * texture).sum(axis=(1, 2))
-    yield compare("blend_backward", "sums of texture", m[:, WEIGHT + 1], expected, GRADIENT)
+    yield compare("blend_backward", "sums of texture", sums[:, WEIGHT + 1], expected, GRADIENT)
     squares = ref.falloff_squares(case.project(), width, height, BACKGROUND.astype(np.float64), weights)
-    yield compare("blend_backward", "sums of squares", m[:, SQUARE], squares, GRADIENT)
+    yield compare("blend_backward", "sums of squares", sums[:, SQUARE], squares, GRADIENT)
     flags = np.where(texture < 0, -1, texture > 0.3).astype(np.float32)
     for scene in (case, safe_case(rng, 300, width, height, 2e-6, _make_opaque)):  # finished pixels
         counts = sum_pixels(device, scene, weights, ALL_SUMS, texture=flags)[:, BLENDED]

@@ -228,7 +228,7 @@ def check_transient(
     yield compare_max("measure_residuals", f"residuals, {label}", values[unmasked], exact[unmasked], 1e-6, floor=1e-6)
     excluded_pixels = actual.get()[0].copy()
     excluded_pixels[:height, :width][unmasked] = -1
-    yield match("measure_residuals", f"pixels that do not count, {label}", excluded_pixels, -1.0)
+    yield match("measure_residuals", f"masked pixels, {label}", excluded_pixels, -1.0)
     histogram = ref.residual_histogram(values[unmasked].astype(np.float64))
     yield match("measure_residuals", f"histogram, {label}", wait_for_histogram(), histogram)
     for quantile, reach in ((0.2, 1), (0.5, 1), (0.6, 3), (0.9, 2)):
@@ -249,7 +249,7 @@ def transients(device: Device, rng: np.random.Generator) -> Results:
 
 # fusion.cl: depth images of views, at the grid points of blocks.
 
-FUSION_MARGIN = 1e-3  # to a decision, px or truncations
+FUSION_MARGIN = 1e-3  # smallest distance of a value from a threshold, in px or truncations
 
 
 def depth_image(rng: np.random.Generator, width: int, height: int) -> DepthImage:

@@ -70,7 +70,7 @@ class FieldCase:
         for layer in shape.layers:
             parameters[layer.first_bias : layer.first_bias + layer.outputs] = rng.normal(0, 0.3, layer.outputs)
         if shape.grid:
-            entries = parameters[shape.network_parameters : shape.network_parameters + shape.grid.parameter_count]
+            entries = parameters[shape.network_length : shape.network_length + shape.grid.parameter_count]
             entries[:] = rng.normal(0, 0.5, len(entries))
         scene = random_case(rng, 1, WIDTH, HEIGHT)
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
@@ -119,7 +119,7 @@ class FieldCase:
 
     def grid_levels(self) -> list[GridLevel]:
         """Return the levels of the hash grid, or an empty list if the field has no grid."""
-        table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.network_parameters
+        table, first = self.shape.grid.table.tolist() if self.shape.grid else [], self.shape.network_length
         return [
             GridLevel(ref.HashLevel(cells, entries), first + FEATURES * offset) for cells, offset, entries, _ in table
         ]
@@ -235,7 +235,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
     grad_features[:, :, ::3] = 0  # samples without a gradient
     gradients = list[NDArray[np.float32]]()
     for parts in (encoding.parts, 1, 3):
-        encoding.parts, sums = parts, device.zeros(shape.parameters)
+        encoding.parts, sums = parts, device.zeros(shape.table_length)
         encoding.backward(device.upload(grad_features), sums)
         gradients.append(sums.get())
     actual, *split_gradients = gradients
@@ -252,7 +252,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
         yield compare("grid_backward", f"level {number}, {label}", grad_entries, expected, GRADIENT)
         is_zero = np.all(expected == 0, axis=1)
         yield match("grid_backward", f"entries without samples, level {number}, {label}", grad_entries[is_zero], 0.0)
-    yield match("grid_backward", f"parameters of the network, {label}", actual[: shape.network_parameters], 0.0)
+    yield match("grid_backward", f"parameters of the network, {label}", actual[: shape.network_length], 0.0)
 
 
 # A field: its network, the colors of rays, the gradients of all parameters, images, and updates.
@@ -272,7 +272,7 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
     """Compare the colors of rays, and the gradients of all parameters through the coarse and fine samples."""
     for count, keys in FIELD_CASES:
         case = FieldCase.sample(device, rng, count, RandomKey(3, 4, 2), **keys)
-        gradient = device.zeros(case.shape.parameters)
+        gradient = device.zeros(case.shape.table_length)
         errors, expected = device.zeros(2 + count), list[ref.Weights]()
         grad_entries = [np.zeros_like(grid.entries(case.parameters)) for grid in case.grid_levels()]
         parameters = case.device_parameters
@@ -295,8 +295,8 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
 
 
 def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[ref.Weights], label: str) -> Results:
-    gradient = gradient[: shape.network_parameters]
-    is_used = np.zeros(shape.network_parameters, bool)
+    gradient = gradient[: shape.network_length]
+    is_used = np.zeros(shape.network_length, bool)
     for number, (layer, (weights, biases)) in enumerate(zip(shape.layers, shape.weights(gradient), strict=True)):
         grad_weights, grad_biases = (sum(level[number][index] for level in expected) for index in (0, 1))
         kernel = "composite_backward" if layer.name in ("density", "color") else "dense_backward"
@@ -375,7 +375,7 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
 def updates_of_fields(device: Device, rng: np.random.Generator) -> Results:
     """Compare three Adam updates from gradients of all magnitudes."""
     field = LearnedField.initial(SHAPE, 0, device.upload(BACKGROUND))
-    count = SHAPE.parameters
+    count = SHAPE.table_length
     values, moment1, moment2 = SHAPE.initial_parameters(0).astype(np.float64), np.zeros(count), np.zeros(count)
     for step, epsilon in enumerate((1e-8, 1e-8, 1e-15), 1):
         gradient = (rng.normal(size=count) * 10.0 ** rng.uniform(-10, 1, count)).astype(np.float32)

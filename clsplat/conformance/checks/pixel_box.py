@@ -65,7 +65,7 @@ def blending_over_the_pixel_box(device: Device, rng: np.random.Generator) -> Res
         squares = ref.falloff_squares(case.project(), 40, 30, BACKGROUND.astype(np.float64), weights)
         yield compare("blend_backward", f"sums of squares, {label}", sums[:, SQUARE], squares, GRADIENT)
     default_sums = sum_pixels(device, case, weights)
-    yield from check_sum(case, default_sums, weights, "without more sums over the pixel's box")
+    yield from check_sum(case, default_sums, weights, "without additional sums over the pixel's box")
 
 
 @CHECKS.add("blend_forward", "blend_backward", "emit_large")

@@ -116,7 +116,7 @@ def _wrong_extents(record: NDArray[Any], truth: ref.Splats, is_rendered: NDArray
 
 
 def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
-    """Compare the gradients of the parameters, computed from the same pixel sums by kernel and reference."""
+    """Compare the gradients of the parameters that the kernel and the reference compute from the same pixel sums."""
     model, camera = case.model(device), case.device_camera(device)
     rasterizer = Rasterizer(device, "radix")
     frame = rasterizer.forward(model, camera, device.zeros(3))
@@ -139,10 +139,10 @@ def check_long_splats(device: Device, case: Case, rng: np.random.Generator, labe
     frame, truth = rasterizer.forward(model, case.device_camera(device), device.zeros(3)), case.project()
     weights, gaussians = scipy.ndimage.gaussian_filter(rng.normal(size=(3, height, width)), (0, 2, 2)), model.gaussians
     exact = ref.blend_backward(truth, width, height, np.zeros(3), weights)
-    m = np.zeros((PIXEL_SUMS, gaussians.capacity), np.float32)
-    m[:, : gaussians.count] = gradients_to_sums(truth, exact).T
-    gradients = rasterizer.gradients(model, frame, device.upload(m))
-    expected = expected_gradients(case, truth, m[:, : gaussians.count].astype(np.float64).T)
+    sums = np.zeros((PIXEL_SUMS, gaussians.capacity), np.float32)
+    sums[:, : gaussians.count] = gradients_to_sums(truth, exact).T
+    gradients = rasterizer.gradients(model, frame, device.upload(sums))
+    expected = expected_gradients(case, truth, sums[:, : gaussians.count].astype(np.float64).T)
     for name in ("means", "quats", "log_scales"):
         value = gradients.arrays[name].get()[:, : gaussians.count].T
         error = np.abs(value - expected[name]).max(axis=1) / np.abs(expected[name]).max()
@@ -151,11 +151,11 @@ def check_long_splats(device: Device, case: Case, rng: np.random.Generator, labe
         yield Deviation("project_backward", median_label, median, LONG_GRADIENT / 10)
 
 
-def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[str, NDArray[Any]]:
+def expected_gradients(case: Case, truth: ref.Splats, sums: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Compute the gradients of all parameters and of the projected means from sums over pixels, [N, PIXEL_SUMS]."""
-    grad_mean2d, grad_conic = sums_to_gradients(truth, m)
-    grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
-    upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
+    grad_mean2d, grad_conic = sums_to_gradients(truth, sums)
+    grad_opacity = np.where(truth.visible, sums[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
+    upstream = grad_mean2d, grad_conic, grad_opacity, sums[:, 6:9]
     gaussians, camera = case.gaussians(), case.camera()
     expected = ref.project_backward(gaussians, camera, case.degree, case.variance, case.compensate, truth, *upstream)
     sh = expected.pop("sh")
@@ -169,7 +169,7 @@ def expected_gradients(case: Case, truth: ref.Splats, m: NDArray[Any]) -> dict[s
 
 
 def undrawable_case(rng: np.random.Generator) -> Case:
-    """Return a case of 40 Gaussians, of which the first nine are behind the camera, huge, faint, or NaN."""
+    """Return a case of 40 Gaussians, the first nine of them behind the camera, huge, faint, or NaN."""
     case = random_case(rng, 40)
     p, pose = case.parameters, case.view.world_to_camera
     p["means"][0] = (np.array([0, 0, -3]) - pose[:, 3]) @ pose[:, :3]
@@ -222,9 +222,13 @@ def projection(device: Device, rng: np.random.Generator) -> Results:
 def projection_of_what_cannot_be_drawn(device: Device, rng: np.random.Generator) -> Results:
     records, keys, radius = project_records(device, undrawable_case(rng))
     culled_rows = [0, 1, 2, 3, 4, 5, 7, 8]
-    yield match("project_forward", "records of Gaussians behind, faint or not finite", records[culled_rows], 0.0)
-    yield match("project_forward", "depths of Gaussians behind, faint or not finite", keys[culled_rows], CULLED)
-    yield match("project_forward", "radii of Gaussians behind or not finite", radius[:6], 0.0)
+    yield match(
+        "project_forward", "records of Gaussians behind the camera, too faint, or not finite", records[culled_rows], 0.0
+    )
+    yield match(
+        "project_forward", "depths of Gaussians behind the camera, too faint, or not finite", keys[culled_rows], CULLED
+    )
+    yield match("project_forward", "radii of Gaussians behind the camera or not finite", radius[:6], 0.0)
     yield count_true("project_forward", "records that are not numbers", np.isnan(records))
 
 
@@ -313,17 +317,17 @@ def depth(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
-    """Compare the gradients of pose and focal length, computed from the same pixel sums by kernel and reference."""
+    """Compare the gradients of pose and focal length that kernel and reference compute from the same pixel sums."""
     model, camera, rasterizer = case.model(device), case.device_camera(device), Rasterizer(device, "radix")
     frame, count = rasterizer.forward(model, camera, device.zeros(3)), model.gaussians.count
     pixel_sums = np.full((PIXEL_SUMS, model.gaussians.capacity), np.nan, np.float32)
     is_rendered = frame.splats.get()[:, 5] > 0
     pixel_sums[:, :count] = rng.normal(size=(PIXEL_SUMS, count)) * is_rendered
     actual = pose_gradient(rasterizer.workspace, model, frame, device.upload(pixel_sums))()
-    m, truth = pixel_sums[:, :count].astype(np.float64).T, case.project()
-    grad_mean2d, grad_conic = sums_to_gradients(truth, m)
-    grad_opacity = np.where(truth.visible, m[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
-    upstream = grad_mean2d, grad_conic, grad_opacity, m[:, 6:9]
+    sums, truth = pixel_sums[:, :count].astype(np.float64).T, case.project()
+    grad_mean2d, grad_conic = sums_to_gradients(truth, sums)
+    grad_opacity = np.where(truth.visible, sums[:, 0] / np.where(truth.visible, truth.opacity, 1), 0)
+    upstream = grad_mean2d, grad_conic, grad_opacity, sums[:, 6:9]
     settings = case.degree, case.variance, case.compensate
     expected = ref.pose_gradient(case.gaussians(), case.camera(), *settings, truth, *upstream)
     rotation = case.camera().rotation

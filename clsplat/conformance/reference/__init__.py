@@ -9,9 +9,9 @@ Conventions: OpenCV camera (x right, y down, z forward); the center of pixel (0,
 from clsplat.conformance.reference.appearance import *
 from clsplat.conformance.reference.blending import *
 from clsplat.conformance.reference.images import *
-from clsplat.conformance.reference.kinds import *
 from clsplat.conformance.reference.motion import *
 from clsplat.conformance.reference.projection import *
 from clsplat.conformance.reference.random import *
 from clsplat.conformance.reference.sky import *
 from clsplat.conformance.reference.training import *
+from clsplat.conformance.reference.types import *

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.kinds import PinholeCamera, RawGaussians, SplatGradients, Splats, Thresholds
 from clsplat.conformance.reference.projection import project
+from clsplat.conformance.reference.types import PinholeCamera, RawGaussians, SplatGradients, Splats, Thresholds
 
 # The mean of a Gaussian over the box of a pixel, as the kernels approximate it (cl_kernels/pixel_box.h).
 
@@ -100,9 +100,9 @@ class BlendStep(NamedTuple):
     falloff: NDArray[Any]  # e^-σ
     alpha: NDArray[Any]
     transmittance: NDArray[Any]  # in front of the splat
-    is_active: NDArray[Any]  # whether the pixel had not stopped before the splat
+    is_active: NDArray[Any]  # whether blending had not stopped before the splat
     is_candidate: NDArray[Any]  # whether it is active, and the splat is not too faint
-    is_blended: NDArray[Any]  # whether it is a candidate, and the splat does not stop it
+    is_blended: NDArray[Any]  # whether it is a candidate, and blending does not stop at the splat
 
 
 def depth_order(splats: Splats) -> NDArray[Any]:
@@ -112,7 +112,7 @@ def depth_order(splats: Splats) -> NDArray[Any]:
 
 
 def blend_steps(splats: Splats, width: int, height: int, thresholds: Thresholds) -> Iterator[BlendStep]:
-    """Yield the blending of each splat, front to back."""
+    """Blend the visible splats front to back, and yield the values of the pixels at each splat."""
     pixel_x, pixel_y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     transmittance = np.ones((height, width))
     is_active = np.ones((height, width), bool)
@@ -176,9 +176,9 @@ def alpha_gradients(
     grad_image: NDArray[Any],
     thresholds: Thresholds = Thresholds(),
 ) -> Iterator[tuple[BlendStep, NDArray[Any]]]:
-    """Yield the blending of each splat, front to back, with dL/dalpha, [H, W], which is zero where alpha is capped.
+    """Blend the visible splats front to back, and yield the values at each splat, with dL/dalpha, [H, W].
 
-    grad_image: [3, H, W].
+    dL/dalpha is zero where alpha is capped.  grad_image: [3, H, W].
     """
     image, final, _ = blend(splats, width, height, background, thresholds)
     through_background = (background_planes(background) * grad_image).sum(axis=0)
@@ -240,9 +240,9 @@ def falloff_squares(
 
 
 class Margin(NamedTuple):
-    """The smallest relative distances of values to thresholds that rounding may cross; infinity without values."""
+    """The smallest relative distances of values to thresholds that rounding may cross; infinity if there are none."""
 
-    alpha: float  # |α / alpha_min - 1| over pixels that have not stopped
+    alpha: float  # |α / alpha_min - 1| over pixels where blending has not stopped
     transmittance: float  # |T' / transmittance_min - 1| over splats that are not too faint
     cap: float  # |o e^-σ / alpha_max - 1|: the image is continuous there, its gradient is not
     depth: float  # relative gap between consecutive splats in the depth order
@@ -308,7 +308,7 @@ def inverse_depth(splats: Splats, width: int, height: int, thresholds: Threshold
 
 
 def median_depth(splats: Splats, width: int, height: int) -> tuple[Floats, Floats]:
-    """Return the depth of the splat that takes the transmittance T below ½, and the least |T - ½|, both [H, W].
+    """Return the depth of the splat that takes the transmittance T below ½, and the smallest |T - ½|, both [H, W].
 
     The depth is 0 where T stays at or above ½.
     """

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.kinds import PinholeCamera
 from clsplat.conformance.reference.random import philox
+from clsplat.conformance.reference.types import PinholeCamera
 
 Floats = NDArray[np.float64]
 DENSITY_BIAS, COLOR_PADDING = -1.0, 0.001

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.kinds import PARAMETERS, RADIUS_TILE, PinholeCamera, RawGaussians, Splats, Thresholds
+from clsplat.conformance.reference.types import PARAMETERS, RADIUS_TILE, PinholeCamera, RawGaussians, Splats, Thresholds
 
 # Spherical harmonics up to degree 3 in the sign convention of 3DGS, and their derivatives.
 

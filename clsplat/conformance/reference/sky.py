@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.reference.kinds import PinholeCamera
+from clsplat.conformance.reference.types import PinholeCamera
 
 Entry = tuple[int, int, float]  # row and column of a texel, weight
 

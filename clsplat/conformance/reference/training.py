@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance.reference.blending import alpha_gradients
-from clsplat.conformance.reference.kinds import PinholeCamera, RawGaussians, Splats, Thresholds
+from clsplat.conformance.reference.types import PinholeCamera, RawGaussians, Splats, Thresholds
 
 
 def adam_step(

@@ -144,8 +144,8 @@ class TrainingModule(Settings):
     """A component of training steps, in addition to the Gaussians."""
 
     order: ClassVar[int] = 0
-    """Modules must be listed in ascending order of this number.  Modules below 20 change the camera, model, background,
-    or photo; those below 30, layers in front of the scene; below 40, colors; below 99, the images that are compared.
+    """Modules must be listed in ascending order of this number.  Below 20, modules change the camera, model,
+    background, or photo; from 20, layers in front of the scene; from 30, colors; from 40, the compared images.
     The order is a number, not a list of modules, so that plug-ins can be ordered too."""
     side_files: ClassVar[Mapping[str, str]] = {}
     """Titles of the files that the module writes to the run folder, by file name; the names start with `view_`."""
@@ -249,7 +249,7 @@ def attach_modules(modules: Sequence[TrainingModule], run: Run, last_step: int) 
 
 
 def modules_so_far(run: Run) -> dict[str, TrainingModule]:
-    """Return the modules of a run's stages up to the current stage, by type; of several with one type, the last."""
+    """Return the modules of a run's stages up to the current stage, by type: the last module of each type."""
     stages = getattr(run.settings, "stages", ())[: run.stage_index + 1]
     modules = (module for stage in stages for module in getattr(stage, "modules", ()))
     return {module.type: module for module in (*modules, *implied_modules(run)) if module.is_active(run.scene)}
@@ -263,7 +263,7 @@ def implied_modules(run: Run, stage: Any = None) -> list[TrainingModule]:
 
 
 def implicit_modules() -> dict[str, type[TrainingModule]]:
-    """Return the classes of modules that are never listed, by type."""
+    """Return the classes of modules that are only implied, never listed in a pipeline, by type."""
     return {
         module.implicit_type: module
         for module in Settings.subclasses

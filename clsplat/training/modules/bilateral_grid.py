@@ -206,7 +206,7 @@ class GridState(ColorState):
         unclamped = workspace.array("grid passed", (3, *image.shape[1:]))
         sums, grad_grid = (
             workspace.array("grid row sums", (ENTRIES * nz * nx, camera.rows)),
-            workspace.array("by grid", row),
+            workspace.array("grad_grid", row),
         )
         program, arguments = workspace.device.program("color_grid.cl"), self._arguments(camera, image, view)
         program.color_grid_backward(

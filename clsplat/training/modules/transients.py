@@ -28,7 +28,7 @@ class Transients(TrainingModule):
 
     A residual is a pixel's absolute difference, averaged over channels.  A running histogram counts the residuals of
     all views; t is the residual at its `quantile`.  While the 99% quantile exceeds `tail_ratio` t, a pixel is masked if
-    its residual exceeds `outlier_ratio` t, and so do most residuals in the box around it.  Because of the box, thin
+    its residual, and most residuals in the box around it, exceed `outlier_ratio` t.  Because of the box, thin
     details that the model has not learned yet are not masked.  Masked pixels are black in both the render and the
     photograph, as with mask files.  The two ratios are not from a paper.
     """
