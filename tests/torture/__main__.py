@@ -113,7 +113,7 @@ def main() -> int:
     for what, (file, *only), share in READERS:
         count = max(1, int(share * options.inputs))
         rows.append(
-            tested(f"damaged {what}", "each read, or rejected in one sentence", count, f"tests/fuzz/{file}", *only)
+            tested(f"damaged {what}", "each read or rejected with one sentence", count, f"tests/fuzz/{file}", *only)
         )
     same = "nothing lost; resumed to the same bits"
     rows.append(tested("a failing write, for each write of a run", same, 1, "tests/runs/test_failing_writes.py"))
