@@ -459,12 +459,14 @@ def convert(
     drop_below: float = 0.0,
     filter_floaters: bool = False,
     level: bool = False,
+    sky: Literal["splats", "none"] | None = None,
     time: float | None = None,
     frames: int | None = None,
     world: bool = False,
 ) -> dict[str, Any]:
     """Merge models into one file, whose suffix selects the format.  Return `format`, `gaussians`, and `bytes`.
 
+    The suffix .html writes a viewer page of the model, without a scene.
     Gaussians with values that are not finite, or with a zero quaternion, are dropped.
 
     crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`
@@ -472,14 +474,15 @@ def convert(
     drop_below: drop Gaussians with a lower opacity
     filter_floaters: drop Gaussians that are large and faint, isolated, or far outside the scene; needs no photos
     level: turn the model so that its ground is at y = 0 and up is -y; the ground must be within 45 degrees of level
+    sky: "splats" writes a learned sky as distant Gaussians, "none" removes it; default: leave it as it is
     time: write a moving model as a static model at this time, in [0, 1]
     frames: write this number of static files at evenly spaced times: PLY files in the folder `out`, or files named
         `out` with a number added
     world: write world coordinates, not coordinates relative to an origin
     """
     from clsplat.gaussians import conversion
-    from clsplat.gaussians.conversion import check_time, convert_frames
     from clsplat.runs.model_file import refuse_field
+    from clsplat.runs.video import PAGE_ENDINGS, convert_to_page
 
     files = [Path(source) for source in ([sources] if isinstance(sources, str | Path) else sources)]
     for file in files:
@@ -492,12 +495,14 @@ def convert(
         level,
         None if box is None else conversion.parse_crop(box),
         conversion.check_degree(sh_degree),
-        check_time(time),
+        conversion.check_time(time),
         world,
+        sky,
     )
     if frames is not None:
-        return convert_frames(files, Path(out), frames, changes, quality)
-    return conversion.convert(files, Path(out), changes, quality)
+        return conversion.convert_frames(files, Path(out), frames, changes, quality)
+    write = convert_to_page if Path(out).suffix.lower() in PAGE_ENDINGS else conversion.convert
+    return write(files, Path(out), changes, quality)
 
 
 def align(

@@ -152,6 +152,9 @@ def convert(
     level: Annotated[
         bool, typer.Option("--level", help="Turn the model upright: its ground at y = 0, up is -y.")
     ] = False,
+    sky: Annotated[
+        Literal["splats", "none"] | None, typer.Option(help="Write a learned sky as distant Gaussians, or remove it.")
+    ] = None,
     time: Annotated[
         float | None, typer.Option(metavar="T", help="Dynamic model: write it at this time, 0 to 1.")
     ] = None,
@@ -161,7 +164,7 @@ def convert(
     ] = None,
     world: Annotated[bool, typer.Option("--world", help="Write world coordinates, without an origin.")] = False,
 ) -> None:
-    """Convert models to another format: PLY, SPZ, SOG, glTF, and others."""
+    """Convert models to another format: PLY, SPZ, SOG, glTF, HTML, CSV, and others."""
     result = commands.convert(
         files[:-1],
         files[-1],
@@ -172,6 +175,7 @@ def convert(
         drop_below=drop_below,
         filter_floaters=filter_floaters,
         level=level,
+        sky=sky,
         time=time,
         frames=frames,
         world=world,

@@ -1,4 +1,4 @@
-"""Represent triangle meshes, and write them as PLY, OBJ, or GLB."""
+"""Represent triangle meshes, and write them as PLY, OBJ, or GLB; write the means of Gaussians as PLY or CSV."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from clsplat.core.files import open_atomic
 from clsplat.formats.gltf_usd import write_primitive
-from clsplat.formats.packing import open_hashed
+from clsplat.formats.packing import open_hashed, write_bytes
 from clsplat.formats.ply import format_ply_header
-from clsplat.formats.splats import FLIP
+from clsplat.formats.splats import FLIP, MAX_LOG, SH_C0, SplatFile, WriteOptions, normalize_quats, opacities
 
 Floats = NDArray[np.float64]
 TRIANGLES = 4  # mode of a primitive in glTF
@@ -104,3 +104,40 @@ def write_glb(path: Path, mesh: Mesh, origin: Floats) -> None:
 
 
 WRITERS: dict[str, Callable[[Path, Mesh, Floats], None]] = {".ply": write_ply, ".obj": write_obj, ".glb": write_glb}
+
+# The means of Gaussians in world coordinates, for programs that cannot show Gaussians.
+
+COLUMNS = "x,y,z,red,green,blue,opacity,scale_x,scale_y,scale_z,rotation_w,rotation_x,rotation_y,rotation_z\n"
+CSV_ROW = ",".join(["%.10g"] * 3 + ["%d"] * 3 + ["%.6g"] * 8) + "\n"
+
+
+def write_points(path: Path, splats: SplatFile, options: WriteOptions) -> str:
+    """Write a PLY of points with colors; return its SHA-256.  Raises OutputError."""
+    positions, colors = _points(splats)
+    rows = np.zeros(len(splats), [("position", "<f8", 3), ("color", "u1", 3)])
+    rows["position"], rows["color"] = positions, colors
+    names = ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue"]
+    return write_bytes(path, format_ply_header(["clsplat"], vertex=(len(rows), names)) + rows.tobytes())
+
+
+def write_csv(path: Path, splats: SplatFile, options: WriteOptions) -> str:
+    """Write a table with a row per Gaussian; return its SHA-256.  Raises OutputError.
+
+    Colors are from 0 to 255, opacities from 0 to 1, scales are standard deviations, and quaternions have unit length.
+    """
+    p = splats.parameters
+    scales = np.exp(np.minimum(p["log_scales"], MAX_LOG))
+    table = np.hstack([*_points(splats), opacities(p["logit_opacity"]), scales, normalize_quats(p["quats"])])
+    with open_hashed(path) as file:
+        file.write(COLUMNS.encode())
+        for start in range(0, len(table), ROWS):
+            block = table[start : start + ROWS]
+            file.write((CSV_ROW * len(block) % tuple(block.ravel().tolist())).encode())
+    return file.sha256
+
+
+def _points(splats: SplatFile) -> tuple[Floats, NDArray[np.uint8]]:
+    """Return the means, [N, 3] world coordinates, and the colors without harmonics, [N, 3] sRGB."""
+    p = splats.parameters
+    colors = np.rint(255 * np.clip(p["sh_base"] * SH_C0 + 0.5, 0, 1)).astype(np.uint8)
+    return p["means"] + np.array(splats.rendering.get("origin", [0.0, 0.0, 0.0])), colors

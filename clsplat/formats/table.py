@@ -13,6 +13,7 @@ from clsplat.core.errors import ConfigError, DataError, OutputError, quote, shor
 from clsplat.core.reading import open_file, require_content
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply
 from clsplat.formats.gltf_usd import gltf_files, looks_like_gltf, read_gltf, write_glb, write_usda
+from clsplat.formats.mesh import write_csv, write_points
 from clsplat.formats.ply import MAX_HEADER, PlyHeader, check_rendering, parse_ply_header, read_ply, write_ply
 from clsplat.formats.sog import META, looks_like_sog, read_sog, sog_folder_files, write_sog
 from clsplat.formats.splat import looks_like_ksplat, looks_like_splat, read_ksplat, read_splat, write_splat
@@ -68,6 +69,7 @@ class Codec:
     keeps_origin: bool = False  # apart from the rendering settings
     has_quality: bool = False  # writing uses WriteOptions.quality
     has_magic: bool = True  # a magic number, or another clear mark at the start of files
+    is_model: bool = True  # not only points
 
 
 # The files of a model.
@@ -179,6 +181,8 @@ CODECS = (
         keeps_mode=False,
         has_magic=False,
     ),
+    Codec("point cloud", (".points.ply",), lambda start: False, None, write_points, is_model=False),
+    Codec("CSV", (".csv",), lambda start: False, None, write_csv, is_model=False),
 )
 
 
@@ -267,6 +271,8 @@ def write(path: Path, splats: SplatFile, options: WriteOptions | None = None) ->
 def warn_about_losses(path: Path, splats: SplatFile) -> None:
     """Warn if the format of a file name cannot store the mark of a mip model, the rendering settings, or the origin."""
     codec = writing_format(path)
+    if not codec.is_model:
+        return
     if not codec.keeps_mode and splats.mode == "mip":
         LOG.warning(
             "%s: %s cannot mark a mip model, so viewers show it as plain 3DGS; PLY, SPZ, SOG, and GLB can",

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import scipy
@@ -82,6 +82,7 @@ def _describe_filter(model: Model) -> str:
 
 OPERATIONS = ("scale", "rotate", "translate")
 QUALITIES = get_args(Quality)
+SkyForm = Literal["splats", "none"]
 
 
 @dataclass(frozen=True)
@@ -96,10 +97,14 @@ class Changes:
     sh_degree: int | None = None  # higher bands are dropped
     time: float | None = None  # of a moving model: the timestamp to extract
     world: bool = False  # write world coordinates instead of an origin
+    sky: SkyForm | None = None  # write a sky as Gaussians, or remove it; None: leave it as it is
 
     def apply(self, model: Model) -> Model:
         """Return the converted model.  Raises DataError if no Gaussian remains, ConfigError for extreme transforms."""
         model = model if self.time is None else _extract_frame(model, self.time)
+        model = without_sky(model) if self.sky == "none" else model
+        if self.sky == "splats" and model.sky is None and model.is_scene.all():
+            raise ConfigError("--sky splats: the model has no sky; omit the option")
         result = model[model.opacities >= self.drop_below] if self.drop_below else model
         if self.filter_floaters:
             result = without_floaters(result)
@@ -113,13 +118,14 @@ class Changes:
             result = leveled(result)
         if self.crop is not None:
             low, high = np.array(self.crop, np.float64).reshape(2, 3) - result.origin
-            result = result[((result.means >= low) & (result.means <= high)).all(axis=1)]
+            is_inside = ((result.means >= low) & (result.means <= high)).all(axis=1)
+            result = result[is_inside | ~result.is_scene if self.sky == "splats" else is_inside]
         if self.sh_degree is not None and self.sh_degree < result.sh_degree:
             result = replace(result, sh_rest=with_degree(result.tables(), self.sh_degree)["sh_rest"])
         if not len(result):
             fault = f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold"
             raise DataError(fault if len(model) else "the model has no Gaussians, or none with valid values")
-        return result
+        return with_sky_splats(result) if self.sky == "splats" else result
 
 
 SOLID = 0.5  # smallest opacity of the Gaussians that may be ground
@@ -229,12 +235,16 @@ def convert(
     check_output(sources, out)
     changes = changes or Changes()
     options = writing_options(out, quality, changes)
-    return write_model(sources, changes.apply(read(sources)), out, options)
+    return write_model(sources, changes.apply(read(sources, changes.sky)), out, options)
 
 
-def read(sources: Sequence[Path]) -> Model:
-    """Read and merge model files or run folders, without Gaussians that are not finite.  Raises DataError."""
-    models = [load(exported_model_path(source), ReadOptions(not_finite="drop")) for source in sources]
+def read(sources: Sequence[Path], sky: SkyForm | None = None) -> Model:
+    """Read and merge model files or run folders, without Gaussians that are not finite.  Raises DataError.
+
+    sky: with "none", a run folder's file without sky Gaussians is preferred.
+    """
+    find = model_path if sky == "none" else exported_model_path
+    models = [load(find(source), ReadOptions(not_finite="drop")) for source in sources]
     return merge_models(models, [str(source) for source in sources])
 
 
@@ -378,7 +388,7 @@ def convert_frames(
     for file in files:
         check_output(sources, file)
     _require_no_other_frames(folder, re.compile(re.escape(prefix) + r"\d{4,}" + re.escape(suffix)), files)
-    options, model = writing_options(files[0], quality, changes), read(sources)
+    options, model = writing_options(files[0], quality, changes), read(sources, changes.sky)
     changes_by_frame = [replace(changes, time=number / (frames - 1)) for number in range(frames)]
     for change in changes_by_frame:  # check all before anything is written
         try:
@@ -495,6 +505,12 @@ def with_sky_splats(model: Model, count: int = COUNT, center: NDArray[np.floatin
         tables["motion"] = np.concatenate([model.motion, static_motion(count, model.motion.shape[1])])
     notes = {**model.rendering.notes, "sky": "splats"}
     return replace(model, **tables, rendering=replace(model.rendering, notes=notes), sky=None)
+
+
+def without_sky(model: Model) -> Model:
+    """Return a model without its sky and without sky Gaussians."""
+    notes = {name: note for name, note in model.rendering.notes.items() if name != "sky"}
+    return replace(model[model.is_scene], rendering=replace(model.rendering, notes=notes), sky=None)
 
 
 def fibonacci_sphere(count: int) -> NDArray[np.float64]:

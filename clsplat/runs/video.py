@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 
 from clsplat.conformance.quick import open_verified
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.core.files import PIPELINE, check_not_run_file
+from clsplat.core.files import PIPELINE, check_not_run_file, scratch_folder
 from clsplat.core.progress import counted
+from clsplat.formats.splats import Quality
+from clsplat.gaussians.conversion import Changes, convert, writing_options
 from clsplat.gaussians.model import Model, load
 from clsplat.nerf.files import is_field
 from clsplat.opencl.device import Device
@@ -174,6 +176,7 @@ def _make_side(
 # A viewer page with one or two models.
 
 MAX_MODELS = 2  # side by side
+PAGE_ENDINGS = (".html", ".htm")
 MANY_SPLATS = 2_000_000  # pages with more splats are slow
 
 
@@ -193,7 +196,7 @@ def view(
     """
     if not 1 <= len(models) <= MAX_MODELS:
         raise ConfigError(f"view: expected one model or two, got {len(models)}")
-    if out.suffix.lower() not in (".html", ".htm"):
+    if out.suffix.lower() not in PAGE_ENDINGS:
         raise ConfigError(f"{out}: expected a name that ends in .html")
     if not (out.is_file() and is_viewer(out)):
         check_not_run_file(out)
@@ -234,6 +237,16 @@ def view(
     packed_models = {name: pack(model, splats) for name, model in named_models}
     Page(title, packed_models, viewpoint, background, views, origin).write(out)
     return out
+
+
+def convert_to_page(sources: Sequence[Path], out: Path, changes: Changes, quality: Quality) -> dict[str, Any]:
+    """Convert models as `conversion.convert` does, but write a viewer page without a scene.  Raises ClsplatError."""
+    writing_options(out, quality, changes)
+    with scratch_folder(out) as folder:
+        file = folder / f"{out.stem}.ply"
+        result = convert(sources, file, changes)
+        page = view([file], None, out, photographs="none")
+    return {**result, "file": str(out), "format": "HTML", "bytes": page.stat().st_size}
 
 
 def _warn_about_size(models_by_name: Mapping[str, Model], max_splats: int | None) -> None:

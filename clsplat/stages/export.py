@@ -20,7 +20,7 @@ from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model, sky_center
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
 
-ENDINGS = tuple(ending for ending in endings() if ending.startswith("."))  # files only; SOG may be a folder too
+ENDINGS = tuple(end for end in endings() if end.startswith(".") and writing_format(Path(end)).is_model)  # no folders
 LOG = logging.getLogger("clsplat")
 
 
@@ -47,6 +47,8 @@ class Export(Scheduled):
 
     @model_validator(mode="after")
     def _check_quality(self) -> "Export":
+        if not writing_format(Path(self.file)).is_model:
+            raise ValueError(f"'{self.file}' is not a model, only points; use a name that ends in .ply, .spz, or .sog")
         if self.quality != "balanced" and not writing_format(Path(self.file)).has_quality:
             raise ValueError(
                 f"'quality' applies to SPZ and SOG; expected a file that ends in .spz or .sog, got '{self.file}'"

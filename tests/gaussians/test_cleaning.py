@@ -1,4 +1,4 @@
-"""`clsplat convert --filter-floaters` and `--level`: planted floaters are found, and little else is removed."""
+"""`clsplat convert` with `--filter-floaters`, `--level`, and `--sky`: it removes what it should, and little else."""
 
 import re
 from dataclasses import replace
@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import clsplat
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.gaussians.conversion import without_floaters
+from clsplat.gaussians.conversion import COUNT, with_sky_splats, without_floaters
 from clsplat.gaussians.model import Model
+from clsplat.gaussians.sky import Sky
 from tests.support.data_sets import data_set
 from tests.support.models import interop
 
@@ -104,3 +105,33 @@ def test_convert_cleans_and_levels(rng, tmp_path):
     floor = model.means[2000:4000].astype(np.float64) + model.origin
     np.testing.assert_allclose(floor[:, 1], 0, atol=0.05)
     np.testing.assert_allclose(np.median(floor, axis=0)[[0, 2]], [5e5, 4e6], atol=3)
+
+
+def assert_same_tables(actual: Model, expected: Model) -> None:
+    for name, table in expected.tables().items():
+        np.testing.assert_array_equal(getattr(actual, name), table, err_msg=name)
+
+
+@pytest.mark.parametrize("source", ["sidecar", "splats"])
+def test_sky_is_written_as_gaussians_or_removed(source, rng, tmp_path, caplog):
+    model = replace(room(rng), sky=Sky(rng.random((64, 3)).astype(np.float32)))
+    expected = with_sky_splats(model)
+    (expected if source == "splats" else model).save(tmp_path / "a.ply")
+    clsplat.convert(tmp_path / "a.ply", tmp_path / "c.ply", sky="splats")
+    assert_same_tables(clsplat.load(tmp_path / "c.ply"), expected)
+    clsplat.convert(tmp_path / "a.ply", tmp_path / "d.ply", sky="none")
+    assert_same_tables(clsplat.load(tmp_path / "d.ply"), model)
+    assert clsplat.load(tmp_path / "d.ply").sky is None
+    assert not list(tmp_path.glob("[cd]_sky.json"))
+    assert not caplog.text
+    clsplat.convert(tmp_path / "a.ply", tmp_path / "e.ply", sky="splats", crop=(-1, -1, -1, 1, 0.5, 1))
+    cropped = clsplat.load(tmp_path / "e.ply")
+    assert len(cropped) - cropped.is_scene.sum() == COUNT
+    assert 0 < cropped.is_scene.sum() < 4000
+
+
+def test_missing_sky_is_an_error(rng, tmp_path):
+    room(rng).save(tmp_path / "a.ply")
+    with pytest.raises(ConfigError, match="--sky splats: the model has no sky; omit the option"):
+        clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", sky="splats")
+    assert clsplat.convert(tmp_path / "a.ply", tmp_path / "b.ply", sky="none")["gaussians"] == 4000

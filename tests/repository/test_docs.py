@@ -52,7 +52,17 @@ HOW_TO = (
         "blocks",
     ),
     *("formats", "align", "viewer", "video", "live", "pipelines", "training", "moving", "nerf", "python"),
-    *("datasets", "devices", "sweeps", "deploy", "extending", "plugin_examples", "reliability", "first_scene"),
+    *(
+        "splat_files",
+        "datasets",
+        "devices",
+        "sweeps",
+        "deploy",
+        "extending",
+        "plugin_examples",
+        "reliability",
+        "first_scene",
+    ),
 )
 NAMED = [(base, kind) for base, kinds in families().items() for kind in kinds]
 

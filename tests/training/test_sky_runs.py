@@ -262,6 +262,10 @@ def test_exported_splats_show_the_sky_without_its_file(yard, sky_run, tmp_path, 
     assert count in (sky_run / "report.html").read_text()
     convert([sky_run], tmp_path / "other.ply")
     assert len(clsplat.load(tmp_path / "other.ply")) == len(trained) + 10_000
+    clsplat.convert(sky_run, tmp_path / "plain.ply", sky="none")
+    plain = clsplat.load(tmp_path / "plain.ply")
+    np.testing.assert_array_equal(plain.means, trained.means)
+    assert plain.sky is None
 
 
 def test_finished_run_exports_its_sky_again(sky_run, tmp_path):
