@@ -3,6 +3,7 @@
  *   covariance trace   P = max(sum_j s_j^2 - tau, 0): bounds the size, and the shape only indirectly
  *   anisotropy         A = max(s_max / s_min - r, 0): bounds the shape, independently of the size
  *   scale, opacity     sum_j s_j, and o: a pressure on all Gaussians, which only Gaussians that images need resist
+ *   smallest scale     s_min: flattens Gaussians
  *
  * One item = LANES Gaussians; each adds to the gradient and writes one sum.  No local memory.  Deterministic. */
 #include "lanes.h"
@@ -86,6 +87,31 @@ void mean_scale(
         total += scale;
     }
     sums[get_global_id(0)] = sum_lanes(total);
+}
+
+/* grad_log_scales += weight s_min, for each axis with the smallest scale. */
+__kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void min_scale(
+    __global const float *restrict log_scales,  // [3,S] log of scene units
+    __global float *restrict grad_log_scales,   // [3,S]
+    __global float *restrict sums,              // [items] sums of s_min, scene units
+    const float weight,                         // scene units^-1
+    const uint stride,
+    const uint count)
+{
+    const uint i = get_global_id(0) * LANES;
+    if (i >= count)
+        return;
+    VF scales[3];
+    for (uint k = 0; k < 3; k++)
+        scales[k] = VLOAD(log_scales + k * stride + i);
+    const VF shortest = smaller(smaller(scales[0], scales[1]), scales[2]), zero = (VF)(0.0f);
+    const VF thickness = (LANE_INDEX + (int)i) < (int)count ? exp_clamped(shortest) : zero;
+    for (uint k = 0; k < 3; k++) {
+        const VF slope = scales[k] == shortest ? weight * thickness : zero;
+        VSTORE(VLOAD(grad_log_scales + k * stride + i) + slope, grad_log_scales + k * stride + i);
+    }
+    sums[get_global_id(0)] = sum_lanes(thickness);
 }
 
 /* grad_logit_opacity += weight o (1 - o). */

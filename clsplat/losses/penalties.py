@@ -75,6 +75,19 @@ class MeanScale(Penalty):
         return LossValue("mean_scale", lambda: weight * float(sums.get().sum(dtype=np.float64)))
 
 
+class MinScale(Penalty):
+    """Mean of the smallest scale of each Gaussian, in units of the scene extent: flattens Gaussians, for surfaces
+    (NeuSG, Chen et al. 2023; PGSR, Chen et al. 2024, uses a weight of 100 and scene units)."""
+
+    type: Literal["min_scale"] = "min_scale"
+
+    def add(self, inputs: PenaltyInputs) -> LossValue:
+        gaussians, sums = inputs.gaussians, inputs.sums("min_scale")
+        weight = at_step(self.weight, inputs.step) / max(1, gaussians.count) / inputs.extent
+        gaussians.device.program("penalty.cl").min_scale(**inputs.arguments("log_scales"), sums=sums, weight=weight)
+        return LossValue("min_scale", lambda: weight * float(sums.get().sum(dtype=np.float64)))
+
+
 class MeanOpacity(Penalty):
     """Mean of all opacities (3DGS-MCMC, Kheradmand et al. 2024)."""
 

@@ -92,6 +92,7 @@ FAULTS = {  # kernel -> file, text, wrong text
     "covariance_trace": ("penalty.cl", "2.0f * weight", "weight"),
     "anisotropy": ("penalty.cl", "(up - down)", "(up + down)"),
     "mean_scale": ("penalty.cl", "total += scale;", "total += 2.0f * scale;"),
+    "min_scale": ("penalty.cl", "scales[k] == shortest ? weight", "scales[k] != shortest ? weight"),
     "mean_opacity": ("penalty.cl", "opacity * (1.0f - opacity)", "opacity * (1.0f + opacity)"),
     "opacity_pressure": ("penalty.cl", "(above ? (VF)(weight) : zero)", "(VF)(weight)"),
     "draw_pixels": ("rays.cl", "RANDOM_PIXELS, 0), (uint2)(seed, 0)).x", "RANDOM_PIXELS, 0), (uint2)(seed, 0)).y"),

@@ -52,7 +52,7 @@ def forget_variants(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_variants_are_the_subclasses_with_a_name():
     images = {"inverse_depth", "l1", "l2", "dssim"}
-    penalties = {"covariance_trace", "anisotropy", "mean_scale", "mean_opacity", "opacity_pressure"}
+    penalties = {"covariance_trace", "anisotropy", "mean_scale", "min_scale", "mean_opacity", "opacity_pressure"}
     assert variants(Loss).keys() == images | penalties
     assert variants(Loss).keys() == variants(ImageLoss).keys() | variants(Penalty).keys()
     assert variants(Order)["shuffle"] is ShuffleOrder

@@ -8,7 +8,7 @@ from clsplat.conformance.scenes import random_case
 from clsplat.gaussians.gaussians import INTERVAL2
 from clsplat.gaussians.structs import GaussianGradients
 from clsplat.losses.base import LossValue, PenaltyInputs
-from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale, MinScale
 from clsplat.methods.natural_selection import OpacityPressure
 from clsplat.render.workspace import Workspace
 from tests.support.devices import on_devices, on_one_setting
@@ -89,6 +89,16 @@ def test_mean_scale(device, rng, count):
 
 
 @on_devices("count", COUNTS)
+def test_min_scale(device, rng, count):
+    """Of equal scales, as Gaussians have at first, each gets the gradient."""
+    inputs, log_scales = inputs_of(device, rng, count)
+    log_scales[1] = log_scales[1, 0]
+    inputs.gaussians.set("log_scales", log_scales)
+    value, gradient = ref.min_scale(log_scales, EXTENT)
+    check(inputs, MinScale(weight=3.0).add(inputs), 3 * value, 3 * gradient)
+
+
+@on_devices("count", COUNTS)
 def test_opacity_pressure_acts_above_its_floor_and_number(device, rng, count):
     inputs, _ = inputs_of(device, rng, count)
     logits = rng.normal(0, 3, (count, 1))
@@ -113,6 +123,7 @@ def test_mean_opacity(device, rng, count):
         lambda x: ref.covariance_trace(x, 0.1, EXTENT),
         lambda x: ref.anisotropy(x, 5.0),
         lambda x: ref.mean_scale(x, EXTENT),
+        lambda x: ref.min_scale(x, EXTENT),
         ref.mean_opacity,
         lambda x: ref.opacity_pressure(x, -1.0),
     ],

@@ -236,6 +236,7 @@ DIFFERENCES = {
         ),
         *("densify.start", "densify.stop", "stages.init.count", "stages.init.min_points", "stages.init.transparent"),
     },
+    ("fast", "surface"): {"losses.min_scale", "losses.min_scale.weight"},
     ("fast", "fast_30k"): {
         *(f"{stage}.every" for stage in ("raise_sh", "densify~2", "average", "evaluate", "checkpoint")),
         *("raise_sh.stop", "densify.stop", "densify~2.stop", "average.start"),

@@ -57,9 +57,9 @@ def flat(value: object, place: str = "") -> dict[str, object]:
 KINDS = (
     *("smoke", "splat", "fast", "photos", "blocks", "compress", "dash_mip_7k", "mcmc_7k", "fastgs_7k", "taming_7k"),
     *("auto_7k", "auto_opti3dgs_7k", "box_7k", "dynamic_7k", "gdgs_7k", "micro_splatting_v2_7k", "mini_7k"),
-    *("gns_7k", "improved_gs_7k", "opti3dgs_7k", "splat_ewa_7k", "steep_7k"),
+    *("gns_7k", "improved_gs_7k", "opti3dgs_7k", "splat_ewa_7k", "steep_7k", "surface"),
 )
 # Those of them whose schedules differ.
 SCHEDULED = tuple(
-    name for name in KINDS if name not in ("box_7k", "gdgs_7k", "opti3dgs_7k", "splat_ewa_7k", "steep_7k")
+    name for name in KINDS if name not in ("box_7k", "gdgs_7k", "opti3dgs_7k", "splat_ewa_7k", "steep_7k", "surface")
 )

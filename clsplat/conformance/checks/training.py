@@ -18,7 +18,7 @@ from clsplat.gaussians.deferred import DeferredHarmonics
 from clsplat.gaussians.gaussians import INTERVAL2, DeviceModel, DropoutMask, Gaussians, hide
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import Penalty, PenaltyInputs
-from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale
+from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale, MinScale
 from clsplat.methods.natural_selection import OpacityPressure
 from clsplat.opencl.device import Array, Device, constants
 from clsplat.render.rasterizer import PIXEL_SUMS, RECORD, Frame, Rasterizer
@@ -203,7 +203,7 @@ def check_penalty(
     yield compare_max(kernel, f"gradient, {label}", actual_gradient, 3 * gradient, 1e-4, floor)
 
 
-@CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "mean_opacity", "opacity_pressure")
+@CHECKS.add("covariance_trace", "anisotropy", "mean_scale", "min_scale", "mean_opacity", "opacity_pressure")
 def penalties(device: Device, rng: np.random.Generator) -> Results:
     for count in COUNTS:
         interval = rng.uniform(0.01, 0.05, count).astype(np.float32)
@@ -217,6 +217,7 @@ def penalties(device: Device, rng: np.random.Generator) -> Results:
         shape = Anisotropy(weight=3.0, above=8.0)
         yield from check_penalty(device, rng, count, shape, lambda s: ref.anisotropy(s, 8.0))
         yield from check_penalty(device, rng, count, MeanScale(weight=3.0), lambda s: ref.mean_scale(s, EXTENT))
+        yield from check_penalty(device, rng, count, MinScale(weight=3.0), lambda s: ref.min_scale(s, EXTENT))
         opacity = MeanOpacity(weight=3.0)
         yield from check_penalty(device, rng, count, opacity, ref.mean_opacity, parameter="logit_opacity")
         pressure = OpacityPressure(weight=3.0, floor=-0.5)

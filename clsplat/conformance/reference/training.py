@@ -69,6 +69,13 @@ def mean_scale(log_scales: NDArray[Any], extent: float) -> tuple[float, NDArray[
     return scales.mean() / extent, scales / scales.size / extent
 
 
+def min_scale(log_scales: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
+    """Return the mean of the smallest scales / extent.  log_scales: [N, 3]."""
+    smallest = np.exp(log_scales.min(axis=1, keepdims=True))
+    is_smallest = log_scales == log_scales.min(axis=1, keepdims=True)
+    return smallest.mean() / extent, smallest * is_smallest / len(log_scales) / extent
+
+
 def mean_opacity(logit_opacity: NDArray[Any]) -> tuple[float, NDArray[Any]]:
     """Return the mean of the opacities.  logit_opacity: [N, 1]."""
     opacities = 1 / (1 + np.exp(-logit_opacity))
