@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from clsplat.scene.images import read_exif_position
 from clsplat.scene.reprojection import project_points
 from clsplat.scene.similarity import UP, Similarity
 from clsplat.scene.viewpoint import up_direction
+from tests.support.colmap_writer import PointEntry
 from tests.support.commands import clsplat as command
 from tests.support.orbit_scene import orbit, write
 
@@ -198,6 +200,18 @@ def test_bare_model_is_leveled_by_its_ground(tmp_path):
     said = command("align", tmp_path / "tilted.ply", tmp_path / "level.ply", "--level", "ground")
     assert "scaled by 1" in said.stdout + said.stderr
     np.testing.assert_allclose(clsplat.load(tmp_path / "level.ply").means[300:, 1], 0, atol=0.01)
+
+
+def test_model_and_its_scene_are_leveled_by_the_same_ground(tmp_path):
+    """The points of the scene; the model's Gaussians are no plane."""
+    places = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 2)).tolist()
+    floor = replace(orbit(), points=[PointEntry((x, y, 0.1 * x - 0.4)) for x, y in places])
+    scene = write(tmp_path / "scene", floor)
+    splats_near_zero().save(tmp_path / "model.ply")
+    of_model = clsplat.align(tmp_path / "model.ply", tmp_path / "level.ply", scene, level="ground")
+    of_scene = clsplat.align(scene, tmp_path / "level", level="ground")
+    assert of_model["matrix"] == of_scene["matrix"]
+    np.testing.assert_allclose(read_scene(tmp_path / "level").points.positions[:, 1], 0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
