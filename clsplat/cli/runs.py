@@ -103,9 +103,9 @@ def resume(
 
 
 def _show_summary(folder: Path) -> None:
-    from clsplat.runs.status import summary
+    from clsplat.runs.status import summarize_run
 
-    for line in summary(folder):
+    for line in summarize_run(folder):
         terminal.print_message(line)
 
 
@@ -128,9 +128,9 @@ def status(
     as_json: JsonOption = False,
 ) -> None:
     """Show the state, step, and metrics of a run, or of all cells of a store, from its files."""
-    from clsplat.runs.status import status_text
-    from clsplat.sweeps.status import overview_text
-    from clsplat.workflows.blocks import status_table
+    from clsplat.runs.status import format_status
+    from clsplat.sweeps.status import format_store_status
+    from clsplat.workflows.blocks import format_status_table
 
     if schema:
         terminal.show_json(commands.status_schema())
@@ -141,8 +141,9 @@ def status(
     if as_json:
         terminal.show_json(state)
     else:
-        text = overview_text if "store" in state else status_table if "in_blocks" in state else status_text
-        terminal.show(text(state))
+        is_store, in_blocks = "store" in state, "in_blocks" in state
+        to_text = format_store_status if is_store else format_status_table if in_blocks else format_status
+        terminal.show(to_text(state))
 
 
 @command(

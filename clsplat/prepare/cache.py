@@ -65,7 +65,9 @@ def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
     for step in steps:
         key = PlannedStep(step, str(source.resolve()), inputs, Path(), "").key
         folder = root / f"{step.stage}-{key[:12]}"
-        planned.append(PlannedStep(step, str(source.resolve()), inputs, folder, _reason(step, inputs, folder, source)))
+        planned.append(
+            PlannedStep(step, str(source.resolve()), inputs, folder, _find_reason(step, inputs, folder, source))
+        )
         inputs = key
     # A step whose result is missing need not run when the result of a later step exists.
     last_result = max((i for i, step in enumerate(planned) if not step.reason), default=-1)
@@ -126,13 +128,13 @@ def fingerprint(folder: Path, excluded_folder: Path) -> str:
     return _digest(entries)
 
 
-def make_note(steps: Sequence[PlannedStep]) -> dict[str, str]:
-    """Return the record of the preparation for a run folder: the hash of the prepared photographs, and their folder."""
+def make_summary(steps: Sequence[PlannedStep]) -> dict[str, str]:
+    """Return the summary of the preparation for a run folder: the hash and the folder of the prepared photographs."""
     return {"inputs": steps[-1].key, "folder": str(steps[-1].folder)}
 
 
-def read_note(out: Path) -> dict[str, str] | None:
-    """Return the record that `make_note` made for a run folder.  None if it is missing or damaged."""
+def read_summary(out: Path) -> dict[str, str] | None:
+    """Return the summary of the preparation in a run folder.  None if it is missing or damaged."""
     try:
         summary = read_json(out / PREPARE_SUMMARY)
         return {"inputs": str(summary["inputs"]), "folder": str(summary["folder"])}
@@ -166,7 +168,7 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
             **result,
         }
         sync_below(temporary)
-        write_text(temporary / RECORD, json.dumps({**record, "files": _sizes(temporary)}, indent=1) + "\n")
+        write_text(temporary / RECORD, json.dumps({**record, "files": _file_sizes(temporary)}, indent=1) + "\n")
         if planned_step.folder.exists():  # a damaged result
             shutil.rmtree(planned_step.folder)
         os.replace(temporary, planned_step.folder)
@@ -194,7 +196,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     return record if is_record and isinstance(record.get("files", {}), dict) else {}
 
 
-def _sizes(folder: Path) -> dict[str, int]:
+def _file_sizes(folder: Path) -> dict[str, int]:
     """Return the sizes in bytes, by relative path, of all files below a folder except the record.
 
     Links, such as links to photographs, are followed.
@@ -219,7 +221,7 @@ def _find_fault(folder: Path) -> str:
     return ""
 
 
-def _reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
+def _find_reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
     """Return why a step must run: its result is damaged, or what changed since the newest result; "" if it need not."""
     if folder.exists():
         fault = _find_fault(folder)

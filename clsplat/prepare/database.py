@@ -48,7 +48,7 @@ def open_database(pycolmap: ModuleType, database: Path) -> Iterator[Any]:
         db.close()
 
 
-def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
+def read_image_names(pycolmap: ModuleType, database: Path) -> list[str]:
     """Return the sorted names of the images in a database.  Empty if the file does not exist."""
     if not database.exists():
         return []
@@ -56,13 +56,13 @@ def image_names(pycolmap: ModuleType, database: Path) -> list[str]:
         return sorted(image.name for image in db.read_all_images())
 
 
-def min_long_side(pycolmap: ModuleType, database: Path) -> int:
+def read_min_long_side(pycolmap: ModuleType, database: Path) -> int:
     """Return the smallest long side of the cameras in a database, px."""
     with open_database(pycolmap, database) as db:
         return int(min(max(camera.width, camera.height) for camera in db.read_all_cameras()))
 
 
-def images_without_features(db: Any) -> dict[int, str]:
+def find_images_without_features(db: Any) -> dict[int, str]:
     """Return the names of the images without features in an open database, by image ID, sorted by name."""
     return {
         image.image_id: image.name
@@ -78,13 +78,13 @@ def clear_features(pycolmap: ModuleType, database: Path) -> None:
             getattr(db, f"clear_{table}")()
 
 
-def feature_counts(pycolmap: ModuleType, database: Path) -> dict[str, int]:
+def read_feature_counts(pycolmap: ModuleType, database: Path) -> dict[str, int]:
     """Return the number of features of each image in a database, by the name of the image."""
     with open_database(pycolmap, database) as db:
         return {image.name: db.num_keypoints_for_image(image.image_id) for image in db.read_all_images()}
 
 
-def verified_pairs(pycolmap: ModuleType, database: Path) -> dict[tuple[str, str], int]:
+def read_verified_pairs(pycolmap: ModuleType, database: Path) -> dict[tuple[str, str], int]:
     """Return the number of verified matches of each pair of images in a database, without pairs that have none."""
     with open_database(pycolmap, database) as db:
         names = {image.image_id: image.name for image in db.read_all_images()}

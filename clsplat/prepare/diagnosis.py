@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import first_few, pluralize
-from clsplat.prepare.database import feature_counts, verified_pairs
+from clsplat.prepare.database import read_feature_counts, read_verified_pairs
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS
 from clsplat.scene.quality import is_blurred, measure_sharpness
 
@@ -33,7 +33,7 @@ class MatchGraph:
     @classmethod
     def from_database(cls, pycolmap: ModuleType, database: Path, images: Path) -> "MatchGraph":
         """Read the graph from COLMAP's database."""
-        return cls(images, feature_counts(pycolmap, database), verified_pairs(pycolmap, database))
+        return cls(images, read_feature_counts(pycolmap, database), read_verified_pairs(pycolmap, database))
 
     @cached_property
     def matches(self) -> dict[str, dict[str, int]]:
@@ -116,12 +116,12 @@ def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str,
         reasons[name] = (
             f"in another model, with {first_few(sorted(model - {name}))}"
             if model
-            else _reason(graph, name, main_model, typical_sharpness)
+            else _explain(graph, name, main_model, typical_sharpness)
         )
     return reasons
 
 
-def _reason(graph: MatchGraph, name: str, placed_names: set[str], typical_sharpness: NDArray[np.float64]) -> str:
+def _explain(graph: MatchGraph, name: str, placed_names: set[str], typical_sharpness: NDArray[np.float64]) -> str:
     matches = graph.matches[name]
     counts = {other: count for other, count in matches.items() if other in placed_names}
     if graph.features[name] < FEW_FEATURES:

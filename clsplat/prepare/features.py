@@ -19,10 +19,10 @@ from clsplat.core.progress import counted
 from clsplat.prepare.database import (
     DATABASE,
     IMAGES,
-    image_names,
-    images_without_features,
+    find_images_without_features,
     open_database,
     raising_data_error,
+    read_image_names,
     remove_database,
     require_pycolmap,
 )
@@ -76,7 +76,7 @@ def find_features(
     if note := shared_camera_note(out / IMAGES, groups):
         LOG.info("%s", note)
     with raising_data_error(photographs, "find features"):
-        if image_names(pycolmap, out / DATABASE) != sorted(names):  # a new or an incomplete database
+        if read_image_names(pycolmap, out / DATABASE) != sorted(names):  # a new or an incomplete database
             remove_database(out / DATABASE)
             _register(pycolmap, out, groups, camera_model)
     add_features(out / IMAGES, out / DATABASE, options)
@@ -96,10 +96,10 @@ def add_features(images: Path, database: Path, options: FeatureOptions) -> None:
     """
     pycolmap = require_pycolmap()
     with raising_data_error(images, "find features"), open_database(pycolmap, database) as db:
-        names_by_id = images_without_features(db)
+        names_by_id = find_images_without_features(db)
         for image_id, name in counted(names_by_id.items(), "photos with features", len(names_by_id)):
             pixels, (scale_x, scale_y) = read_gray(images / name, options.long_side)
-            keypoints, descriptors = sift(pixels, options)
+            keypoints, descriptors = detect_sift(pixels, options)
             keypoints[:, :3] *= scale_x, scale_y, (scale_x + scale_y) / 2
             with pycolmap.DatabaseTransaction(db):
                 db.write_keypoints(image_id, keypoints)
@@ -107,7 +107,7 @@ def add_features(images: Path, database: Path, options: FeatureOptions) -> None:
                 db.write_descriptors(image_id, pycolmap.FeatureDescriptors(data=descriptors, type=feature_type))
 
 
-def sift(pixels: NDArray[np.uint8], options: FeatureOptions) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def detect_sift(pixels: NDArray[np.uint8], options: FeatureOptions) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the keypoints, [M, 4], and descriptors, [M, 128], of the features with the highest contrast.
 
     Keypoints are x, y and scale in px, and the angle in radians, as COLMAP stores them: pixel (0, 0) has its center at

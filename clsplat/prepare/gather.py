@@ -27,7 +27,7 @@ from clsplat.scene.images import (
     read_gray,
     write_exposures,
 )
-from clsplat.scene.lookup import unsupported_cameras
+from clsplat.scene.lookup import describe_unsupported_cameras
 from clsplat.scene.multicamera import VIDEO_SUFFIXES
 from clsplat.scene.quality import is_blank
 from clsplat.scene.times_file import read_times, write_times
@@ -55,8 +55,8 @@ def list_photographs(folder: Path, excluded_folder: Path | None = None) -> list[
 
     Logs a warning about files in other formats.  Raises DataError when there are too few photographs.
     """
-    names, unreadable_names = _photo_names(folder, excluded_folder)
-    for warning in (*_conversion_hints(unreadable_names), unsupported_cameras(folder)):
+    names, unreadable_names = _list_photo_names(folder, excluded_folder)
+    for warning in (*_conversion_hints(unreadable_names), describe_unsupported_cameras(folder)):
         if warning:
             LOG.warning("%s: %s", folder, warning)
     require_photographs(folder, excluded_folder)
@@ -76,13 +76,13 @@ def require_folder(folder: Path) -> None:
 
 def require_photographs(folder: Path, excluded_folder: Path | None = None) -> None:
     """Raise DataError when there are fewer than MIN_PHOTOGRAPHS photographs below a folder."""
-    names, unreadable_names = _photo_names(folder, excluded_folder)
+    names, unreadable_names = _list_photo_names(folder, excluded_folder)
     if len(names) < MIN_PHOTOGRAPHS:
         suffixes = ", ".join(sorted(IMAGE_SUFFIXES))
         hints = "".join(f"; {text}" for text in _conversion_hints(unreadable_names))
         raise DataError(
             f"{folder}: has {pluralize(len(names), 'photo')}; "
-            f"expected at least {MIN_PHOTOGRAPHS}, better 30 or more that overlap by two thirds ({suffixes}){hints}"
+            f"expected at least {MIN_PHOTOGRAPHS}, preferably 30 or more that overlap by two thirds ({suffixes}){hints}"
         )
 
 
@@ -96,7 +96,7 @@ def _conversion_hints(unreadable_names: list[str]) -> list[str]:
     return hints
 
 
-def _photo_names(folder: Path, excluded_folder: Path | None) -> tuple[list[str], list[str]]:
+def _list_photo_names(folder: Path, excluded_folder: Path | None) -> tuple[list[str], list[str]]:
     """Return the sorted names of the photographs below a folder, and the names of files in unreadable formats."""
     require_folder(folder)
     names: list[str] = []

@@ -21,26 +21,26 @@ from clsplat.prepare.database import (
     IMAGES,
     MODEL,
     clear_features,
-    image_names,
-    min_long_side,
     raising_data_error,
+    read_image_names,
+    read_min_long_side,
+    read_verified_pairs,
     require_pycolmap,
-    verified_pairs,
 )
 from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unplaced
 from clsplat.prepare.features import FeatureOptions, add_features
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS, link, log_warnings
 from clsplat.prepare.matching import Pairing, expand_pairs, match_database, match_pairs
-from clsplat.prepare.rotation_only import no_depth_reason
+from clsplat.prepare.rotation_only import explain_missing_depth
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
-ENOUGH = 0.9  # fraction of the photographs; if it is placed, no attempt with denser features follows
+ENOUGH = 0.9  # fraction of the photographs that must be placed to skip the attempts with denser features
 DENSE, ENLARGED, WIDER = (f".{name}.{DATABASE}" for name in ("dense", "enlarged", "wider"))
 DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01)
 SMALL = 1200  # px, long side; smaller photographs are enlarged to twice their size if denser features are not enough
 FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap raises the middle two
-PAIR = 2  # track length of points that COLMAP drops from its models
+TWO_VIEWS = 2  # track length of points that COLMAP drops from its models
 PAIR_ERROR = 1.0  # px, mean reprojection error; strict, since the two rays of any pair of features nearly meet
 PAIR_ANGLE = 1.5  # degrees between two rays, as COLMAP requires for all points
 LOOSE = {  # COLMAP's defaults: 100 matches, 16 degrees, 30 matches, a quarter of them
@@ -57,24 +57,24 @@ class Attempt:
 
     label: str  # describes the attempt in the log
     mapper: Mapper = "incremental"
-    loose: bool = False  # accept fewer matches and smaller angles
-    wider: bool = False  # match unplaced photographs with more others, unless all pairs were matched
-    dense: bool = False  # find more features, and match the same pairs
-    enlarged: bool = False  # find the features of small photographs at twice their size, unless none is small
+    is_loose: bool = False  # accept fewer matches and smaller angles
+    has_more_pairs: bool = False  # match unplaced photographs with more others, unless all pairs were matched
+    is_dense: bool = False  # find more features, and match the same pairs
+    is_enlarged: bool = False  # find the features of small photographs at twice their size, unless none is small
 
-    def database(self, source: Path, out: Path) -> Path:
+    def database_path(self, source: Path, out: Path) -> Path:
         """Return the path of the database with the features and matches of the attempt."""
-        if self.dense:
-            return out / (ENLARGED if self.enlarged else DENSE)
-        return out / WIDER if self.wider else source / DATABASE
+        if self.is_dense:
+            return out / (ENLARGED if self.is_enlarged else DENSE)
+        return out / WIDER if self.has_more_pairs else source / DATABASE
 
 
 RETRIES = (
-    Attempt("smaller angles and fewer matches", loose=True),
-    Attempt("more pairs", loose=True, wider=True),
-    Attempt("denser features", loose=True, dense=True),
-    Attempt("denser features of enlarged photos", loose=True, dense=True, enlarged=True),
-    Attempt("denser features, all cameras at once", "global", dense=True),
+    Attempt("smaller angles and fewer matches", is_loose=True),
+    Attempt("more pairs", is_loose=True, has_more_pairs=True),
+    Attempt("denser features", is_loose=True, is_dense=True),
+    Attempt("denser features of enlarged photos", is_loose=True, is_dense=True, is_enlarged=True),
+    Attempt("denser features, all cameras at once", "global", is_dense=True),
 )
 MAX_ATTEMPTS = 1 + len(RETRIES)
 
@@ -95,47 +95,47 @@ def map_cameras(
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
-    names = image_names(pycolmap, source / DATABASE)
+    names = read_image_names(pycolmap, source / DATABASE)
     graph = MatchGraph.from_database(pycolmap, source / DATABASE, source / IMAGES)
-    if reason := no_depth_reason(pycolmap, source / DATABASE):
+    if reason := explain_missing_depth(pycolmap, source / DATABASE):
         raise DataError(f"{source / IMAGES}: the photos {reason}")
-    models, best, extra_pairs, tries = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
+    models, best, extra_pairs, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
     for attempt in (first, *_retries(pycolmap, source / DATABASE)):
         placed_count = models[0].num_reg_images() if models else 0
-        if tries == attempts or placed_count == len(names) or (attempt.dense and placed_count >= ENOUGH * len(names)):
+        missing = set(names) - _placed_names(*models[:1])
+        if count == attempts or not missing or (attempt.is_dense and placed_count >= ENOUGH * len(names)):
             break
-        if attempt.dense and not models and graph.has_unrelated_photographs():
+        if attempt.is_dense and not models and graph.has_unrelated_photographs():
             break  # denser features would not help: most photographs have nothing in common
         try:
-            if attempt.wider and not (extra_pairs := expand_pairs(source / DATABASE, set(names) - _names(*models[:1]))):
+            if attempt.has_more_pairs and not (extra_pairs := expand_pairs(source / DATABASE, missing)):
                 continue
             if attempt is not first:
                 LOG.info("placed %d of %d photos; trying again with %s", placed_count, len(names), attempt.label)
-            tries += 1
+            count += 1
             candidates = _run_attempt(source, out, attempt, threads, models[:1], extra_pairs)
-            if attempt.wider:
-                graph = MatchGraph.from_database(pycolmap, attempt.database(source, out), source / IMAGES)
+            if attempt.has_more_pairs:
+                graph = MatchGraph.from_database(pycolmap, attempt.database_path(source, out), source / IMAGES)
         except FAILURES as error:
-            if not (attempt.wider or models):
+            if not (attempt.has_more_pairs or models):
                 raise
             LOG.warning("skipping a failed attempt: %s", error)
-            if not attempt.wider:
+            if not attempt.has_more_pairs:
                 break
             extra_pairs, candidates = [], []
         if candidates and candidates[0].num_reg_images() > placed_count:
             models, best = candidates, attempt
     if not models:
         raise DataError(f"{source / IMAGES}: the {len(names)} photos could not be placed: {diagnose(graph)}")
-    database = best.database(source, out)
-    if reason := no_depth_reason(pycolmap, database, _names(models[0])):
-        counts = f"{models[0].num_reg_images()} of {len(names)}"
-        raise DataError(f"{source / IMAGES}: the {counts} photos that were placed {reason}")
-    if best.dense:
+    database, placed_names = best.database_path(source, out), _placed_names(models[0])
+    if reason := explain_missing_depth(pycolmap, database, placed_names):
+        raise DataError(f"{source / IMAGES}: the {len(placed_names)} of {len(names)} photos that were placed {reason}")
+    if best.is_dense:
         graph = MatchGraph.from_database(pycolmap, database, source / IMAGES)
-    if min_track_length == PAIR:
+    if min_track_length == TWO_VIEWS:
         models[0] = triangulate_pairs(models[0], database, out, threads)
     result = {**_write_best(models, out, names), "attempt": best.label, "denser_tried": (out / DENSE).exists()}
-    result["reasons"] = explain_unplaced(graph, [_names(model) for model in models])
+    result["reasons"] = explain_unplaced(graph, [_placed_names(model) for model in models])
     _remove_hidden(out)
     log_warnings(result)
     return result
@@ -143,8 +143,8 @@ def map_cameras(
 
 def _retries(pycolmap: ModuleType, database: Path) -> list[Attempt]:
     """Return the attempts after the first one that make a difference for photographs of these sizes."""
-    has_small = min_long_side(pycolmap, database) < SMALL
-    return [attempt for attempt in RETRIES if has_small or not attempt.enlarged]
+    has_small = read_min_long_side(pycolmap, database) < SMALL
+    return [attempt for attempt in RETRIES if has_small or not attempt.is_enlarged]
 
 
 def _remove_hidden(folder: Path) -> None:
@@ -161,7 +161,7 @@ def _run_attempt(
     """
     pycolmap = require_pycolmap()
     database, work_folder = _fill_database(source, out, attempt, pairs), out / ".models"
-    if not verified_pairs(pycolmap, database):
+    if not read_verified_pairs(pycolmap, database):
         return []
     shutil.rmtree(work_folder, ignore_errors=True)
     work_folder.mkdir()
@@ -170,18 +170,18 @@ def _run_attempt(
     options.num_threads = options.mapper.num_threads = threads
     options.random_seed = options.mapper.random_seed = 0
     options.min_model_size = MIN_PHOTOGRAPHS
-    if attempt.loose:
+    if attempt.is_loose:
         options.mapper.mergedict(LOOSE)
     pycolmap.set_random_seed(0)
     with raising_data_error(source / IMAGES, "place the cameras"):
         run_mapper = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
-        counter = ItemCounter("photos placed", len(image_names(pycolmap, database)))
+        counter = ItemCounter("photos placed", len(read_image_names(pycolmap, database)))
 
         def on_placed() -> None:
             counter.reach(min(max(2, counter.done) + 1, counter.total))
 
         arguments: dict[str, Any] = {} if is_global else {"next_image_callback": on_placed}
-        if attempt.loose and not attempt.dense and previous:
+        if attempt.is_loose and not attempt.is_dense and previous:
             (out / ".before").mkdir(exist_ok=True)
             previous[0].write(str(out / ".before"))
             arguments["input_path"] = str(out / ".before")
@@ -196,17 +196,17 @@ def _fill_database(source: Path, out: Path, attempt: Attempt, pairs: Sequence[tu
 
     The pairs depend only on the first database and the previous model, so they are the same after an interruption.
     """
-    database, pairing = attempt.database(source, out), Pairing.read(source)
+    database, pairing = attempt.database_path(source, out), Pairing.read(source)
     if not database.exists():
         partial = database.with_name(f".half.{DATABASE}")
         shutil.copyfile(source / DATABASE, partial)
-        if attempt.dense:
+        if attempt.is_dense:
             clear_features(require_pycolmap(), partial)
         partial.replace(database)
-    if attempt.dense:
-        add_features(source / IMAGES, database, replace(DENSER, min_side=SMALL if attempt.enlarged else 0))
+    if attempt.is_dense:
+        add_features(source / IMAGES, database, replace(DENSER, min_side=SMALL if attempt.is_enlarged else 0))
         match_database(database, pairing)
-    if attempt.dense or attempt.wider:
+    if attempt.is_dense or attempt.has_more_pairs:
         match_pairs(database, pairs, pairing.threads)
     return database
 
@@ -216,10 +216,10 @@ def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[
     best = models[0]
     (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
     best.write(str(out / MODEL / "0"))
-    placed_names, new_counts, covered_names = _names(best), list[int](), set[str]()
+    placed_names, new_counts, covered_names = _placed_names(best), list[int](), set[str]()
     for model in models:
-        new_counts.append(len(_names(model) - covered_names))
-        covered_names |= _names(model)
+        new_counts.append(len(_placed_names(model) - covered_names))
+        covered_names |= _placed_names(model)
     return {
         "registered": len(placed_names),
         "not_registered": [name for name in names if name not in placed_names],
@@ -229,7 +229,7 @@ def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[
     }
 
 
-def _names(*models: Any) -> set[str]:
+def _placed_names(*models: Any) -> set[str]:
     return {model.images[image_id].name for model in models for image_id in model.reg_image_ids()}
 
 
@@ -249,7 +249,9 @@ def triangulate_pairs(model: Any, database: Path, out: Path, threads: int = 1) -
         new_model = pycolmap.triangulate_points(
             model, str(database), str(out / IMAGES), folder, clear_points=True, options=options
         )
-    inaccurate_ids = [i for i, p in new_model.points3D.items() if p.track.length() == PAIR and p.error > PAIR_ERROR]
+    inaccurate_ids = [
+        i for i, p in new_model.points3D.items() if p.track.length() == TWO_VIEWS and p.error > PAIR_ERROR
+    ]
     for point_id in inaccurate_ids:
         new_model.delete_point3D(point_id)
     return new_model

@@ -25,11 +25,11 @@ from clsplat.prepare.database import (
     MATCHING,
     PAIRS,
     count_matched_pairs,
-    image_names,
     open_database,
     raising_data_error,
+    read_image_names,
+    read_verified_pairs,
     require_pycolmap,
-    verified_pairs,
 )
 from clsplat.prepare.gather import link
 
@@ -58,12 +58,12 @@ class Pairing:
 def match_features(
     source: Path, out: Path, matching: Matching = "auto", neighbors: int = 10, threads: int = 1
 ) -> dict[str, Any]:
-    """Match all pairs of photographs, or each photograph with the `neighbors` next by name or the `neighbors` most
-    similar.
+    """Match the pairs of photographs that `matching` selects, and write a database to the folder `out`.
 
-    `auto` matches all pairs of up to 200 photographs; for more, each photograph with the most similar ones.  Returns
-    the method that was used, and the number of pairs that match.  More than one thread is faster but not
-    bit-identical: in about one in a hundred calls of pycolmap 4.2, two pairs get different matches.
+    `exhaustive` selects all pairs, `sequential` each photograph and the next `neighbors` by name, `vocabulary` each
+    photograph and the 2 `neighbors` most similar ones.  `auto` is exhaustive for up to 200 photographs, and otherwise
+    vocabulary.  Returns the method that was used, and the number of pairs that match.  More than one thread is faster
+    but not bit-identical: in about one in a hundred calls of pycolmap 4.2, two pairs get different matches.
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
@@ -75,7 +75,7 @@ def match_features(
     pairing = Pairing(matching, neighbors, threads)
     write_text(out / MATCHING, json.dumps(asdict(pairing)) + "\n")
     method = match_database(database, pairing)
-    return {"matching": method, "pairs": len(verified_pairs(pycolmap, database))}
+    return {"matching": method, "pairs": len(read_verified_pairs(pycolmap, database))}
 
 
 def max_pair_count(photographs: int, matching: Matching, neighbors: int) -> int:
@@ -91,9 +91,9 @@ def match_database(database: Path, pairing: Pairing) -> Matching:
     Returns the method that was used: never `auto`.  Raises DataError when pycolmap fails.
     """
     pycolmap = require_pycolmap()
-    count, matching, neighbors = len(image_names(pycolmap, database)), pairing.matching, pairing.neighbors
+    count, matching, neighbors = len(read_image_names(pycolmap, database)), pairing.matching, pairing.neighbors
     method = ("exhaustive" if count <= MAX_EXHAUSTIVE else "vocabulary") if matching == "auto" else matching
-    common_options = _options(pycolmap, pairing.threads)
+    common_options = _make_options(pycolmap, pairing.threads)
     with raising_data_error(database, "match photos"):
         if method == "sequential":
             options = pycolmap.SequentialPairingOptions()
@@ -104,7 +104,7 @@ def match_database(database: Path, pairing: Pairing) -> Matching:
                 pycolmap.match_sequential(str(database), pairing_options=options, **common_options)
         elif method == "vocabulary":
             LOG.info("matching %d photos, each with the %d most similar", count, 2 * neighbors)
-            pairs = _find_similar_pairs(pycolmap, database, 2 * neighbors)
+            pairs = _read_similar_pairs(pycolmap, database, 2 * neighbors)
             with _count_pairs(database, len(pairs)):
                 _match_pairs(database, pairs, common_options)
         else:
@@ -125,7 +125,7 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
         return
     LOG.info("matching %s of photos without a camera", pluralize(len(new_pairs), "more pair"))
     with raising_data_error(database, "match photos"), _count_pairs(database, matched_count + len(new_pairs)):
-        _match_pairs(database, new_pairs, _options(pycolmap, threads))
+        _match_pairs(database, new_pairs, _make_options(pycolmap, threads))
 
 
 def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
@@ -153,12 +153,14 @@ def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
             and not db.exists_two_view_geometry(images[i].image_id, images[j].image_id)
         ]
         if len(candidates) > max_pairs:
-            similarities = similarity(_descriptors(db, images))
-            candidates = _closest_pairs(candidates, similarities, is_unplaced, max(1, max_pairs // sum(is_unplaced)))
+            similarities = compute_similarities(_read_descriptors(db, images))
+            candidates = _select_closest_pairs(
+                candidates, similarities, is_unplaced, max(1, max_pairs // sum(is_unplaced))
+            )
     return [(images[i].name, images[j].name) for i, j in candidates]
 
 
-def _closest_pairs(
+def _select_closest_pairs(
     pairs: Sequence[tuple[int, int]], similarities: NDArray[np.float64], is_unplaced: Sequence[bool], count: int
 ) -> list[tuple[int, int]]:
     """Return the pairs of each unplaced photograph with the `count` most similar photographs."""
@@ -171,7 +173,7 @@ def _closest_pairs(
     return sorted(closest)
 
 
-def _options(pycolmap: ModuleType, threads: int) -> dict[str, Any]:
+def _make_options(pycolmap: ModuleType, threads: int) -> dict[str, Any]:
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads, verification.ransac.random_seed = False, threads, 0
     return {"matching_options": matching, "verification_options": verification, "device": pycolmap.Device.cpu}
@@ -186,18 +188,18 @@ def _match_pairs(database: Path, pairs: Sequence[tuple[str, str]], options: dict
     pycolmap.match_image_pairs(str(database), pairing_options=pairing, **options)
 
 
-def _find_similar_pairs(pycolmap: ModuleType, database: Path, neighbors: int) -> list[tuple[str, str]]:
+def _read_similar_pairs(pycolmap: ModuleType, database: Path, neighbors: int) -> list[tuple[str, str]]:
     with open_database(pycolmap, database) as db:
         images = sorted(db.read_all_images(), key=lambda image: image.name)
-        descriptors = _descriptors(db, images)
+        descriptors = _read_descriptors(db, images)
     if bad_names := [image.name for image in images if _has_space(image.name)]:
         raise DataError(
             f"'{bad_names[0]}': COLMAP's pair lists do not allow spaces in names; rename it, or match all pairs"
         )
-    return [(images[i].name, images[j].name) for i, j in similar_pairs(descriptors, neighbors)]
+    return [(images[i].name, images[j].name) for i, j in find_similar_pairs(descriptors, neighbors)]
 
 
-def _descriptors(db: Any, images: Sequence[Any]) -> list[NDArray[np.float32]]:
+def _read_descriptors(db: Any, images: Sequence[Any]) -> list[NDArray[np.float32]]:
     return [np.asarray(db.read_descriptors(image.image_id).data, np.float32) for image in images]
 
 
@@ -214,18 +216,18 @@ def _count_pairs(database: Path, pairs: int) -> Iterator[None]:
     counter.reach(pairs)
 
 
-def similar_pairs(descriptors: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
+def find_similar_pairs(descriptors: Sequence[NDArray[np.float32]], neighbors: int) -> list[tuple[int, int]]:
     """Return the pairs (i, j), i < j, of each photograph with the `neighbors` most similar ones.
 
     descriptors: the descriptors of each photograph, [M, 128].
     """
-    similarities = similarity(descriptors)
+    similarities = compute_similarities(descriptors)
     np.fill_diagonal(similarities, -1)
     nearest = np.argsort(-similarities, axis=1, kind="stable")[:, : min(neighbors, len(descriptors) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row})
 
 
-def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
+def compute_similarities(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float64]:
     """Return the similarities between N photographs, [N, N], from 0 to 1.
 
     descriptors: the descriptors of each photograph, [M, 128].  Visual words are the clusters of k-means over a sample
@@ -239,7 +241,7 @@ def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float64
     if not len(sample):
         return np.zeros((len(descriptors), len(descriptors)))
     counts = np.zeros((len(descriptors), WORDS))
-    words = _visual_words(sample)
+    words = _fit_visual_words(sample)
     for row, matrix in enumerate(descriptors):
         if len(matrix):
             distance = (words**2).sum(axis=1) - 2 * matrix @ words.T
@@ -250,7 +252,7 @@ def similarity(descriptors: Sequence[NDArray[np.float32]]) -> NDArray[np.float64
     return np.asarray(vectors @ vectors.T)
 
 
-def _visual_words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
+def _fit_visual_words(sample: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the visual words, [at most WORDS, 128]: the centers of k-means over a sample of descriptors, [M, 128]."""
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0)

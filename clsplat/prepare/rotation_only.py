@@ -30,7 +30,7 @@ SAME = f"are all the same, {REMEDY}"
 Floats = NDArray[np.float64]
 
 
-def no_depth_reason(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
+def explain_missing_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
     """Return the reason why depth cannot be estimated from photographs, by default all, or "" if it may be possible.
 
     All good pairs are tested, since the best pair of each photograph may come from one of several viewpoints.  The
@@ -40,7 +40,7 @@ def no_depth_reason(pycolmap: ModuleType, database: Path, names: Set[str] | None
     with open_database(pycolmap, database) as db:
         all_names = {image.image_id: image.name for image in db.read_all_images()}
         names_by_id = {image_id: name for image_id, name in all_names.items() if names is None or name in names}
-        pairs = _good_pairs(pycolmap, db, names_by_id.keys())
+        pairs = _read_good_pairs(pycolmap, db, names_by_id.keys())
         if not names_by_id or 2 * len({image_id for pair in pairs for image_id in pair.photographs}) < len(names_by_id):
             return ""
         moving_pairs = [pair for pair in pairs if not _is_still(*pair.points())]
@@ -48,7 +48,7 @@ def no_depth_reason(pycolmap: ModuleType, database: Path, names: Set[str] | None
             still_pairs = [(names_by_id[a], names_by_id[b]) for a, b in (pair.photographs for pair in pairs)]
             return SAME if len(connected_groups(names_by_id.values(), still_pairs)) == 1 else ""
         sample = moving_pairs[:: -(-len(moving_pairs) // MAX_PAIRS)]
-        homographies = [matrix for pair in sample if (matrix := _homography(*pair.points())) is not None]
+        homographies = [matrix for pair in sample if (matrix := _fit_homography(*pair.points())) is not None]
     if len(homographies) < 2 or len(homographies) < MIN_EXPLAINED * len(sample):
         return ""
     return ROTATED if min(_rotation_deviation(homographies, focal) for focal in FOCALS) < MAX_DEVIATION else ""
@@ -71,7 +71,7 @@ class _Pair:
         return first[self.matches[:, 0]], second[self.matches[:, 1]], pixel_size
 
 
-def _good_pairs(pycolmap: ModuleType, db: Any, image_ids: Set[int]) -> list[_Pair]:
+def _read_good_pairs(pycolmap: ModuleType, db: Any, image_ids: Set[int]) -> list[_Pair]:
     """Return the pairs of photographs that have enough matches, the pair with the most matches first."""
     sizes = {camera.camera_id: np.array([camera.width, camera.height]) for camera in db.read_all_cameras()}
 
@@ -93,7 +93,7 @@ def _is_still(first: Floats, second: Floats, pixel_size: float) -> bool:
     return bool(np.median(np.linalg.norm(second - first, axis=1)) < MAX_RESIDUAL * pixel_size)
 
 
-def _homography(first: Floats, second: Floats, pixel_size: float) -> Floats | None:
+def _fit_homography(first: Floats, second: Floats, pixel_size: float) -> Floats | None:
     """Return the homography, [3, 3], that explains nearly all matches of a pair, or None if there is none."""
     matrix, inliers = cv2.findHomography(first, second, cv2.RANSAC, MAX_RESIDUAL * pixel_size)
     if matrix is None or inliers.mean() < MIN_EXPLAINED:

@@ -12,9 +12,9 @@ from clsplat.runs.estimate import estimate_time
 from clsplat.runs.opening import (
     ReadScene,
     check_start,
-    expected_measures,
+    expect_measures,
+    list_photo_names,
     open_run,
-    photo_names,
     read_run_scene,
     resolve_choices,
 )
@@ -67,7 +67,7 @@ def describe(
             restored_checkpoint = restore(pipeline, run)
             verdict = f"would continue from step {run.step}" if restored_checkpoint else "nothing to resume; would run"
         check_run(pipeline, run)
-    names = photo_names(pipeline, planned_steps, out) if run is None else []
+    names = list_photo_names(pipeline, planned_steps, out) if run is None else []
     measures, refusal_lines = _expect_measures(pipeline, names)
     lines += [*refusal_lines, *(f"  adapt          {reason}" for reason in pipeline.reasons)]
     if undecided_keys := pipeline.undecided:
@@ -86,7 +86,7 @@ def _expect_measures(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures
     If the run would be refused even with a camera for every photo, the measures are None, and a line gives the reason.
     """
     try:
-        return expected_measures(pipeline, names), []
+        return expect_measures(pipeline, names), []
     except DataError as error:
         return None, [f"  photos         if all {len(names)} photos get a camera, the run is refused: {error}"]
 

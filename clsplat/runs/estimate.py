@@ -23,10 +23,10 @@ from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.run import Run
 
-PIXEL, GAUSSIAN = 1.0e-7, 4.0e-7  # s per pixel and per Gaussian in a training step, on one AVX-512 core
-WEIGHT, LEVEL = 2.0e-11, 2.0e-8  # s per network weight and per grid level of a field, for each sample
-LAUNCHES = 1.0e-3  # s per step for kernel launches, independent of its size
-SLOWER = 6.0  # factor for slower processors and larger Gaussians than in the benchmark
+PIXEL_SECONDS, GAUSSIAN_SECONDS = 1.0e-7, 4.0e-7  # s per pixel and per Gaussian in a training step, on one AVX-512 core
+WEIGHT_SECONDS, LEVEL_SECONDS = 2.0e-11, 2.0e-8  # s per network weight and per grid level of a field, for each sample
+LAUNCH_SECONDS = 1.0e-3  # s per step for kernel launches, independent of its size
+SLOWDOWN = 6.0  # factor for slower processors and larger Gaussians than in the benchmark
 MIN_GAUSSIANS = 5000  # initial number for a small capture whose points are unknown
 MAX_PER_PIXEL = 1.0  # Gaussians per pixel of an image, if no setting limits them; typical captures end at 0.1 to 1
 
@@ -42,7 +42,7 @@ class Estimate:
     @property
     def text(self) -> str:
         """The estimate in one line."""
-        return f"  {self.name:<14} {minutes_text(self.seconds)}: {self.reason}"
+        return f"  {self.name:<14} {format_minutes(self.seconds)}: {self.reason}"
 
 
 def estimate_time(
@@ -57,21 +57,21 @@ def estimate_time(
 
     names, measures: file names and measures of the photos to prepare.  run: None if the scene is not prepared yet.
     """
-    estimates = list(_preparation_estimates(planned_steps, len(names))) if names else []
-    if (training_size := _training_size(pipeline, planned_steps, names, run)) is not None:
+    estimates = list(_estimate_preparation(planned_steps, len(names))) if names else []
+    if (training_size := _find_training_size(pipeline, planned_steps, names, run)) is not None:
         settings = (apply_adaptation(pipeline, measures) if measures and run is None else pipeline).settings
         training_stages = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-        estimates += [_training_estimate(training, *training_size, device.info.units) for training in training_stages]
+        estimates += [_estimate_training(training, *training_size, device.info.units) for training in training_stages]
     field_stages = [stage for stage in pipeline.settings.stages if isinstance(stage, TrainField)]
-    estimates += [_field_estimate(training, device.info.units) for training in field_stages]
+    estimates += [_estimate_field(training, device.info.units) for training in field_stages]
     if not estimates:
         return []
     low, high = (sum(estimate.seconds[end] for estimate in estimates) for end in (0, 1))
-    total = f"expected: {minutes_text((low, high))}, roughly, without evaluation, renders, and pages"
+    total = f"expected: {format_minutes((low, high))}, roughly, without evaluation, renders, and pages"
     return [total, *(estimate.text for estimate in estimates)]
 
 
-def _preparation_estimates(planned_steps: Sequence[PlannedStep], photo_count: int) -> Iterator[Estimate]:
+def _estimate_preparation(planned_steps: Sequence[PlannedStep], photo_count: int) -> Iterator[Estimate]:
     """Yield an estimate for each preparation step that is due."""
     for planned_step in planned_steps:
         if planned_step.reason and (seconds := planned_step.step.seconds) is not None:
@@ -79,7 +79,7 @@ def _preparation_estimates(planned_steps: Sequence[PlannedStep], photo_count: in
             yield Estimate(planned_step.step.stage, (seconds[0] * count, seconds[1] * count), f"{count:,} {unit}")
 
 
-def _training_size(
+def _find_training_size(
     pipeline: Pipeline, planned_steps: Sequence[PlannedStep], names: Sequence[str], run: Run | None
 ) -> tuple[tuple[int, int], int] | None:
     """Return the size of the training images, px, and the initial number of Gaussians; None if the size is unknown."""
@@ -104,7 +104,7 @@ def _first_photo_size(folder: Path, names: Sequence[str]) -> tuple[int, int] | N
     return None
 
 
-def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, units: int) -> Estimate:
+def _estimate_training(training: Optimize, size: tuple[int, int], initial: int, units: int) -> Estimate:
     """Estimate the time of a training stage, from its minimum and maximum numbers of steps and Gaussians.
 
     size: width and height of the images, px.  initial: the initial number of Gaussians.  units: as for `step_seconds`.
@@ -113,19 +113,20 @@ def _training_estimate(training: Optimize, size: tuple[int, int], initial: int, 
     maximum = max(initial, int(max_gaussians(training) or MAX_PER_PIXEL * pixels))
     low, high = step_seconds(units, size, initial)[0], step_seconds(units, size, maximum)[1]
     steps = training.min_steps, training.steps * (2 if training.refit else 1)
-    steps_text, counts_text = (_range(*(f"{end:,}" for end in ends)) for ends in (steps, (initial, maximum)))
+    steps_text, counts_text = (_format_range(*(f"{end:,}" for end in ends)) for ends in (steps, (initial, maximum)))
     reason = f"{steps_text} steps of {_format_ms(low, high)}, with {counts_text} Gaussians at {size[0]}x{size[1]} px"
     return Estimate(training.stage, (steps[0] * low, steps[1] * high), reason)
 
 
-def _field_estimate(training: TrainField, units: int) -> Estimate:
+def _estimate_field(training: TrainField, units: int) -> Estimate:
     """Estimate the time of a stage that trains a field.  All its steps take the same time."""
     shape = training.field
     samples = training.rays * (shape.coarse_samples + shape.fine_samples)
-    sample_seconds = WEIGHT * shape.network_length + LEVEL * (shape.grid.levels if shape.grid else 0)
-    low = LAUNCHES + samples * sample_seconds / units
-    reason = f"{training.steps:,} steps of {_format_ms(low, SLOWER * low)}, of {training.rays:,} rays"
-    return Estimate(training.stage, (training.steps * low, training.steps * SLOWER * low), reason)
+    levels = shape.grid.levels if shape.grid else 0
+    sample_seconds = WEIGHT_SECONDS * shape.network_length + LEVEL_SECONDS * levels
+    low = LAUNCH_SECONDS + samples * sample_seconds / units
+    reason = f"{training.steps:,} steps of {_format_ms(low, SLOWDOWN * low)}, of {training.rays:,} rays"
+    return Estimate(training.stage, (training.steps * low, training.steps * SLOWDOWN * low), reason)
 
 
 def max_gaussians(training: Optimize) -> float | None:
@@ -140,19 +141,19 @@ def step_seconds(units: int, size: tuple[int, int], count: int) -> tuple[float, 
 
     units: number of compute units of the device.  size: width and height of an image, px.  count: number of Gaussians.
     """
-    seconds = LAUNCHES + (PIXEL * size[0] * size[1] + GAUSSIAN * count) / units
-    return seconds, SLOWER * seconds
+    seconds = LAUNCH_SECONDS + (PIXEL_SECONDS * size[0] * size[1] + GAUSSIAN_SECONDS * count) / units
+    return seconds, SLOWDOWN * seconds
 
 
-def minutes_text(seconds: Sequence[float]) -> str:
+def format_minutes(seconds: Sequence[float]) -> str:
     """Format a minimum and a maximum time in seconds as a range of minutes."""
     minutes = [max(0.1, end / 60) for end in seconds]
-    return _range(*(f"{end:.0f}" if end >= 10 else f"{end:.1f}" for end in minutes)) + " min"
+    return _format_range(*(f"{end:.0f}" if end >= 10 else f"{end:.1f}" for end in minutes)) + " min"
 
 
 def _format_ms(low: float, high: float) -> str:
-    return _range(f"{1e3 * low:.0f}", f"{1e3 * high:.0f}") + " ms"
+    return _format_range(f"{1e3 * low:.0f}", f"{1e3 * high:.0f}") + " ms"
 
 
-def _range(low: str, high: str) -> str:
+def _format_range(low: str, high: str) -> str:
     return low if low == high else f"{low} to {high}"

@@ -30,7 +30,7 @@ from clsplat.photos.photographs import Photographs
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.loading import load as load_pipeline
-from clsplat.prepare.cache import read_note
+from clsplat.prepare.cache import read_summary
 from clsplat.render.painter import Painter, SplatPainter
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.results import read_metrics
@@ -195,7 +195,7 @@ def find_run(model: Path) -> Path | None:
     for folder in filter(has_pipeline, file.parents):
         with suppress(ConfigError):
             if file in {
-                path for stage in _exports(load_pipeline(str(folder / PIPELINE))) for path in stage.outputs(folder)
+                path for stage in _list_exports(load_pipeline(str(folder / PIPELINE))) for path in stage.outputs(folder)
             }:
                 return folder
     return None
@@ -209,14 +209,14 @@ def photo_folder(scene: Path) -> Path:
     """
     if not has_pipeline(scene):
         return scene
-    note = read_note(scene)
+    note = read_summary(scene)
     folder = Path(note["folder"]) if note else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
     if not folder.is_dir():
         raise DataError(f"{scene}: the folder of its photos, {folder}, is missing; pass the folder of the scene")
     return folder
 
 
-def _exports(pipeline: Pipeline) -> list[Export | ExportField]:
+def _list_exports(pipeline: Pipeline) -> list[Export | ExportField]:
     stages = [item for stage in pipeline.stages for item in (stage, *getattr(stage, "during", ()))]
     return [stage for stage in stages if isinstance(stage, Export | ExportField)]
 

@@ -19,7 +19,7 @@ from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.input_files import content_hashes
 from clsplat.pipeline.loading import Pipeline, apply_adaptation, prepared_folder
 from clsplat.pipeline.stretching import map_trainings
-from clsplat.prepare.cache import PlannedStep, make_note, prepare, read_note, read_statistics
+from clsplat.prepare.cache import PlannedStep, make_summary, prepare, read_statistics, read_summary
 from clsplat.prepare.gather import list_photographs
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.runs.estimate import estimate_time
@@ -121,15 +121,18 @@ def open_run(
         status.enter("preparing", device=opened_device.label)
     status = status or StatusFile(out)
     if any(step.reason for step in planned_steps):
-        names = photo_names(pipeline, planned_steps, out)
-        lines = estimate_time(pipeline, planned_steps, names, expected_measures(pipeline, names), opened_device, None)
+        names = list_photo_names(pipeline, planned_steps, out)
+        lines = estimate_time(pipeline, planned_steps, names, expect_measures(pipeline, names), opened_device, None)
         LOG.info("%s", "".join(lines[:1]))
     folder, root = pipeline.settings.scene.folder, prepared_folder(out)
     with listening(count_listener(status)):
         folder = prepare(planned_steps, folder, root, status.stage)
         with status.stage(READ_SCENE):
             run = make_run(pipeline, read(pipeline.settings.scene, folder), opened_device, out, status)
-    run.prepared, run.preparation = make_note(planned_steps) if planned_steps else None, read_statistics(planned_steps)
+    run.prepared, run.preparation = (
+        make_summary(planned_steps) if planned_steps else None,
+        read_statistics(planned_steps),
+    )
     return run
 
 
@@ -157,12 +160,12 @@ def check_start(
         stage.check()
     opened_device = open_verified(device, settings.rasterizer.schedule, settings.rasterizer.sort)
     planned_steps = check_preparation(pipeline, out)
-    if planned_steps and start != "restart" and read_note(out) not in (None, make_note(planned_steps)):
+    if planned_steps and start != "restart" and read_summary(out) not in (None, make_summary(planned_steps)):
         raise ConfigError(f"{out}: was started with other photos or other settings of `prepare`; use another folder")
     return opened_device, planned_steps
 
 
-def photo_names(pipeline: Pipeline, steps: Sequence[PlannedStep], out: Path) -> list[str]:
+def list_photo_names(pipeline: Pipeline, steps: Sequence[PlannedStep], out: Path) -> list[str]:
     """Return the names of the photos to prepare; empty if there are none, or if the pipeline does not prepare photos.
 
     Skipped files are logged.
@@ -189,7 +192,7 @@ def check_preparation(pipeline: Pipeline, out: Path) -> list[PlannedStep]:
 def _check_split(pipeline: Pipeline, planned_steps: Sequence[PlannedStep], out: Path) -> None:
     """Raise DataError if the split would reject the photos to prepare, even if all of them get a camera."""
     with log_level(logging.ERROR):
-        names = photo_names(pipeline, planned_steps, out)
+        names = list_photo_names(pipeline, planned_steps, out)
     if not names:
         return
     pipeline.settings.scene.split.check(pipeline.settings.scene.folder, names)
@@ -197,7 +200,7 @@ def _check_split(pipeline: Pipeline, planned_steps: Sequence[PlannedStep], out: 
         _placeholder_scene(pipeline, names)
 
 
-def expected_measures(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
+def expect_measures(pipeline: Pipeline, names: Sequence[str]) -> Measures | None:
     """Return the measures that are known before the preparation, or None if there are no photos to prepare.
 
     Only the number of training and validation photos is known, and only if all of them get a camera.  Raises DataError

@@ -21,7 +21,7 @@ from clsplat.core.files import (
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_file, sha256
 from clsplat.pipeline.loading import Pipeline
-from clsplat.runs.state import Phase, RunState, damaged_files, is_below, read_sums
+from clsplat.runs.state import Phase, RunState, find_damaged_files, is_below, read_sums
 from clsplat.scene.images import is_image
 from clsplat.stages.export import sky_gaussians
 from clsplat.stages.report import is_overfit
@@ -75,7 +75,7 @@ def previous_sums(pipeline: Pipeline, run: Run) -> dict[str, str]:
     rewritten_files = [path for stage in stages if not isinstance(stage, Training) for path in stage.outputs(run.out)]
     rewritten_files += [run.out / name for name in (PIPELINE, METRICS)]
     previous = {name: value for name, value in sums.items() if not is_below(run.out / name, rewritten_files)}
-    damaged_names, growing_files = damaged_files(run.out, previous), [run.out / RECORDS, *training_files]
+    damaged_names, growing_files = find_damaged_files(run.out, previous), [run.out / RECORDS, *training_files]
     return {n: value for n, value in previous.items() if n in damaged_names or not is_below(run.out / n, growing_files)}
 
 
@@ -163,7 +163,7 @@ def check_outputs(pipeline: Pipeline, run: Run, damaged: Collection[str] = ()) -
     outputs = [path for stage in pipeline.stages for path in stage.outputs(run.out)]
     models = {name: value for name, value in run.model_hashes.items() if is_below(run.out / name, outputs)}
     faults = {name for name in (METRICS, PIPELINE, *declared_outputs(pipeline)) if not (run.out / name).is_file()}
-    if faults := (faults | {*damaged_files(run.out, models)}) - {*damaged}:
+    if faults := (faults | {*find_damaged_files(run.out, models)}) - {*damaged}:
         fault = "is missing, or changed after the run wrote it"
         raise OutputError(f"{run.out / min(faults)}: {fault}; see {run.out / LOG_FILE}")
 

@@ -15,7 +15,7 @@ from clsplat.pipeline import plugins
 from clsplat.pipeline.explanation import explain
 from clsplat.pipeline.file import SceneSettings
 from clsplat.pipeline.yaml_file import read_yaml
-from clsplat.prepare.cache import read_note
+from clsplat.prepare.cache import read_summary
 from clsplat.runs.state import RunState
 from clsplat.training.records import Records
 
@@ -88,7 +88,7 @@ class RunFolder:
         if METRICS not in state.names:
             raise DataError(f"{path}: has no {METRICS} because the run is {state.state_name}; finish it with --resume")
         settings = read_settings(path)
-        return cls(path, settings, _scene(path, settings), read_metrics(path / METRICS))
+        return cls(path, settings, _parse_scene_settings(path, settings), read_metrics(path / METRICS))
 
     @property
     def plugin_faults(self) -> list[str]:
@@ -100,7 +100,7 @@ class RunFolder:
     @property
     def photo_folder(self) -> Path:
         """The folder of the photos that the run trained on.  Raises ConfigError if the pipeline names no scene."""
-        note = read_note(self.path)
+        note = read_summary(self.path)
         return Path(note["folder"]) if note else self.scene.folder
 
     @cached_property
@@ -143,7 +143,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     return {"stages": [], **data}
 
 
-def _scene(path: Path, settings: dict[str, Any]) -> SceneSettings:
+def _parse_scene_settings(path: Path, settings: dict[str, Any]) -> SceneSettings:
     try:
         return SceneSettings.model_validate(settings.get("scene", {}))
     except ValidationError as error:

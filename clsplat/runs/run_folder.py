@@ -29,7 +29,7 @@ from clsplat.core.files import (
 from clsplat.core.reading import read_text
 from clsplat.pipeline.loading import Pipeline
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.prepare.cache import make_note, read_note
+from clsplat.prepare.cache import make_summary, read_summary
 from clsplat.runs.state import Phase, RunState
 from clsplat.training.status import StatusFile
 
@@ -140,7 +140,7 @@ def check_run_folder(state: RunState, start: Start) -> None:
         raise ConfigError(
             f"{out}: is finished, but has no checkpoint to continue from; {state.restart_command} trains it again"
         )
-    if state.phase is Phase.STATELESS:
+    if state.phase is Phase.LOST_STATE:
         raise OutputError(
             f"{out}: both {STATUS} and the checkpoints of its run are missing; restore them, or start over with "
             f"{state.restart_command}"
@@ -180,4 +180,4 @@ def is_up_to_date(pipeline: Pipeline, state: RunState) -> bool:
     """Return whether a run of this pipeline on the same photos is finished; always False without `prepare` steps."""
     if not pipeline.settings.prepare or state.phase is not Phase.DONE or state.difference(pipeline):
         return False
-    return read_note(state.out) == make_note(pipeline.preparation(state.out))
+    return read_summary(state.out) == make_summary(pipeline.preparation(state.out))

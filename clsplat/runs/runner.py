@@ -17,7 +17,7 @@ from clsplat.pipeline.stretching import map_trainings
 from clsplat.prepare.inspect.findings import check_view_count
 from clsplat.runs.outputs import check_outputs, previous_sums, save_checksums, write_checksums, write_metrics
 from clsplat.runs.run_folder import RESOLVED, Start, clear
-from clsplat.runs.state import damaged_files
+from clsplat.runs.state import find_damaged_files
 from clsplat.scene.identity import Identity
 from clsplat.stages.densify import Densify
 from clsplat.stages.optimize import Optimize
@@ -146,7 +146,7 @@ def execute(pipeline: Pipeline, run: Run, start: Start, show: Callable[[Progress
         LOG.info("%s", note)
     run.status.require_lock()
     write_metrics(pipeline, run)
-    damaged_names = damaged_files(run.out, previous)
+    damaged_names = find_damaged_files(run.out, previous)
     check_outputs(pipeline, run, damaged_names)
     write_checksums(pipeline, run, previous)
     for name in damaged_names:

@@ -28,7 +28,7 @@ class Phase(IntEnum):
     """The folder has only a status.json, because no stage has started."""
     BEGUN = 2
     """The run has started, and may have stopped before its end."""
-    STATELESS = 3
+    LOST_STATE = 3
     """The run has started, but both its status and its checkpoints are missing."""
     DONE = 4
     """The run has finished; `RunState.bad_files` lists the files that are missing or changed."""
@@ -61,7 +61,7 @@ class RunState:
         if not has_begun:
             return Phase.PREPARING if STATUS in self.names else Phase.EMPTY
         is_known = self.status or self.checkpoints or INPUTS not in self.names
-        return Phase.BEGUN if is_known else Phase.STATELESS
+        return Phase.BEGUN if is_known else Phase.LOST_STATE
 
     @property
     def state_name(self) -> str:
@@ -79,7 +79,7 @@ class RunState:
         """The files that are missing or changed; of a finished run, also checksums.json if it is missing."""
         if self.sums is None:
             return [CHECKSUMS] if self.phase is Phase.DONE and "cells" not in self.status else []
-        return damaged_files(self.out, self.sums)
+        return find_damaged_files(self.out, self.sums)
 
     def difference(self, pipeline: Pipeline) -> str:
         """Return the difference between another pipeline and the run's pipeline as text, or "" if they are the same.
@@ -110,7 +110,7 @@ class RunState:
             return f"{self.pipeline.settings.training.stage}.steps"
         return "optimize.steps"
 
-    def note_on_longer_training(self) -> str:
+    def describe_longer_training(self) -> str:
         """Describe how a continued training differs from training with all steps from the start; "" if it does not."""
         training = self.pipeline.settings.training
         steps = training.steps
@@ -157,7 +157,7 @@ def read_sums(out: Path) -> dict[str, str] | None:
     return {name: str(value) for name, value in sums.items() if is_inside(name)} if isinstance(sums, dict) else None
 
 
-def damaged_files(out: Path, sums: Mapping[str, str]) -> list[str]:
+def find_damaged_files(out: Path, sums: Mapping[str, str]) -> list[str]:
     """Return the names of the files in a list of checksums that are missing or changed."""
     return [name for name, value in sums.items() if try_sha256(out / name) != value]
 

@@ -68,13 +68,15 @@ def _last_report(out: Path) -> dict[str, Any] | None:
     return lines[-1] if lines else None
 
 
-def status_text(status: dict[str, Any]) -> str:
+def format_status(status: dict[str, Any]) -> str:
     """Format the result of `run_status` as text."""
-    lines = [f"{status['run']}: {status['state']}{_progress(status)}"]
+    lines = [f"{status['run']}: {status['state']}{_format_progress(status)}"]
     if status.get("silent", 0) >= HEARTBEAT_TIMEOUT:
-        lines.append(f"no heartbeat for {status['silent']} s{_process(status)}")
+        lines.append(f"no heartbeat for {status['silent']} s{_describe_process(status)}")
     if status.get("ahead"):
-        lines.append(f"its clock is {status['ahead']} s ahead{_process(status)}; whether the run continues is unknown")
+        lines.append(
+            f"its clock is {status['ahead']} s ahead{_describe_process(status)}; whether the run continues is unknown"
+        )
     if status.get("message"):
         lines.append(status["message"])
     if status["advice"]:
@@ -103,7 +105,7 @@ def _advice(state: RunState) -> str:
     return f"no checkpoint was saved; `{resume_command}` starts it over"
 
 
-def _progress(status: dict[str, Any]) -> str:
+def _format_progress(status: dict[str, Any]) -> str:
     """Format the progress of the run and of its current stage."""
     if "cells" in status:
         failed = status["failed"] if isinstance(status.get("failed"), dict) else {}
@@ -130,7 +132,7 @@ def _format_numbers(record: dict[str, Any], names: tuple[str, ...]) -> str:
     )
 
 
-def _process(status: dict[str, Any]) -> str:
+def _describe_process(status: dict[str, Any]) -> str:
     """Return the host on which a run is executed, or its process ID if it is on this machine."""
     owner = Owner.from_record(status)
     is_remote = owner is not None and not owner.is_local
@@ -143,7 +145,7 @@ TITLES = {"export": "model", "export_field": "field", "render": "renders", "opti
 MIN_SECONDS = 0.5  # shorter stages are omitted
 
 
-def summary(folder: Path) -> list[str]:
+def summarize_run(folder: Path) -> list[str]:
     """Return the lines of the summary; empty for an unfinished run or a matrix.  Raises DataError for damaged files."""
     if not (folder / METRICS).exists():
         return []

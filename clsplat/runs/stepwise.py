@@ -30,7 +30,7 @@ def train(pipeline: Pipeline, run: Run) -> Iterator[ViewGradients]:
     pipeline = with_refit_steps(full_pipeline, run)
     if starts_refit:
         run_until_training(pipeline, run)
-    first_index, last_index = _training_stages(pipeline)
+    first_index, last_index = _training_stage_indices(pipeline)
     for index in range(max(first_index, run.stage_index), last_index + 1):
         if index > run.stage_index:
             run.next_stage(index)
@@ -59,13 +59,13 @@ def _run_final_edits(pipeline: Pipeline, run: Run) -> None:
 
 def is_trained(pipeline: Pipeline, run: Run) -> bool:
     """Return whether all training steps have run, including the steps of a refit."""
-    _, last_index = _training_stages(pipeline)
+    _, last_index = _training_stage_indices(pipeline)
     stage = with_refit_steps(pipeline, run).stages[last_index]
     is_at_end = isinstance(stage, Optimize) and run.stage_index == last_index and stage.has_ended(run)
     return (run.stage_index > last_index or is_at_end) and not is_refit_due(run)
 
 
-def _training_stages(pipeline: Pipeline) -> tuple[int, int]:
+def _training_stage_indices(pipeline: Pipeline) -> tuple[int, int]:
     """Return the indices of the first and the last training stage."""
     indices = [i for i, stage in enumerate(pipeline.stages) if isinstance(stage, Optimize)]
     return indices[0], indices[-1]

@@ -32,7 +32,7 @@ from clsplat.training.status import StatusFile
 LOG = logging.getLogger("clsplat")
 CORRECTIONS = 0.3, 0.6, 0.85  # fractions of the training
 STEPS = 200  # of the first rehearsal; a training stage may declare a smaller number
-LONGER = 3  # factor by which the next rehearsal has more steps
+STEP_FACTOR = 3  # factor by which the next rehearsal has more steps
 MIN_FRACTION = 0.03  # of the budget; a shorter rehearsal is followed by a longer one
 REPORTS = 20  # minimum number per training; each contains the median time of the steps since the previous one
 MAX_FRACTION = 0.2  # of the budget; after this time, a rehearsal stops training
@@ -147,9 +147,9 @@ def rehearse_enough(pipeline: Pipeline, run: Run, minutes: float, deadline: floa
     steps, start_time, trend = min(STEPS, pipeline.settings.training.rehearsal_steps), time.perf_counter(), 0.0
     rehearsal = rehearse(pipeline, run, steps, minutes, deadline)
     while time.perf_counter() - start_time < MIN_FRACTION * 60 * minutes:
-        previous, steps, start_time = rehearsal, LONGER * steps, time.perf_counter()
+        previous, steps, start_time = rehearsal, STEP_FACTOR * steps, time.perf_counter()
         rehearsal = rehearse(pipeline, run, steps, minutes, deadline)
-        trend = math.log(fmean(rehearsal.step_times) / fmean(previous.step_times)) / math.log(LONGER)
+        trend = math.log(fmean(rehearsal.step_times) / fmean(previous.step_times)) / math.log(STEP_FACTOR)
     return replace(rehearsal, trend=min(max(trend, -MAX_TREND), MAX_TREND))
 
 

@@ -30,7 +30,7 @@ from clsplat.pipeline import plugins
 from clsplat.pipeline.files import origin, shipped_pipelines
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import load_experiment
-from clsplat.prepare.cache import read_note
+from clsplat.prepare.cache import read_summary
 from clsplat.runs.outputs import declared_outputs
 from clsplat.runs.results import read_metrics, read_settings
 from clsplat.runs.state import Phase, RunState
@@ -75,8 +75,8 @@ def check_checkpoint(path: Path) -> str:
     return f"step {state.step}, {size_text(gaussians, state.field['parameters'] if state.field else None)}"
 
 
-def check_note(path: Path) -> None:
-    if read_note(path.parent) is None:
+def check_prepare_summary(path: Path) -> None:
+    if read_summary(path.parent) is None:
         raise DataError("expected the hash and the folder of the prepared photos")
 
 
@@ -172,7 +172,7 @@ def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool =
     if is_done or INPUTS in names:
         yield check_one(INPUTS, lambda path: Identity.from_data(read_json(path)))
     if (is_done and settings.get("prepare")) or PREPARE_SUMMARY in names:
-        yield check_one(PREPARE_SUMMARY, check_note)
+        yield check_one(PREPARE_SUMMARY, check_prepare_summary)
     for name in dict.fromkeys([*sums, *files, *sorted({METRICS, RECORDS} & names)]):
         if name != PIPELINE:
             yield check_one(name, partial(check_output, sums.get(name)))
@@ -225,7 +225,7 @@ def _remedy(state: RunState, verified: dict[str, Any]) -> str:
         return "ignore them: all outputs are intact, and only longer training needs these files"
     intact_files = {Path(verified["run"], entry["file"]) for entry in verified["objects"] if entry["whole"]}
     can_continue = "cells" in state.status or any(path in intact_files for path in state.checkpoints)
-    can_continue |= state.phase < Phase.STATELESS and not (state.checkpoints or state.status.get("checkpoint"))
+    can_continue |= state.phase < Phase.LOST_STATE and not (state.checkpoints or state.status.get("checkpoint"))
     if state.out / PIPELINE not in intact_files:
         option = "--resume" if can_continue else "--restart"
         return f"run its `clsplat run … --out {shell_quote(state.out)}` again, with {option}"

@@ -96,7 +96,7 @@ def make_video(
     content = _read(model)
     is_alone = scene is None and find_run(model) is None and isinstance(content, Model)
     needs_scene = request.needs_scene or not (request.is_file or is_alone)
-    used_scene = _scene(model, scene, content, downscale, is_required=needs_scene or extras.side == PHOTOGRAPH)
+    used_scene = _read_scene(model, scene, content, downscale, is_required=needs_scene or extras.side == PHOTOGRAPH)
     origin = used_scene.origin if used_scene else content.origin
     content = content.in_scene(used_scene) if used_scene else content
     plan = plan_video(request, used_scene, content_points(content, used_scene), is_moving(content), origin)
@@ -130,7 +130,7 @@ def _read(model: Path) -> AnyModel:
     return read(file if is_field(file) else model)
 
 
-def _scene(
+def _read_scene(
     model: Path, scene: Path | None, host_model: AnyModel, downscale: float | None, is_required: bool
 ) -> Scene | None:
     """Return the scene of a model at the image size of its run, or None if the scene is unknown and not required."""

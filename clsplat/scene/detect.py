@@ -10,7 +10,7 @@ from clsplat.formats.table import detect as model_format
 from clsplat.scene.colmap import ColmapReader, find_models, read_images
 from clsplat.scene.images import is_image
 from clsplat.scene.llff import LlffReader
-from clsplat.scene.lookup import unsupported_cameras, walk_folders
+from clsplat.scene.lookup import describe_unsupported_cameras, walk_folders
 from clsplat.scene.multicamera import MulticameraReader
 from clsplat.scene.reader import Reader, reader_classes
 from clsplat.scene.scene import HOLDOUT, Scene
@@ -125,7 +125,7 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
             logger.info("%s: %s", path, reader.note)
         reader.missing = split.missing
         return split.apply(replace(reader.read(reader.folder, split.reader_holdout), path=path))
-    note = f"; {message}" if (message := unsupported_cameras(path)) else ""
+    note = f"; {message}" if (message := describe_unsupported_cameras(path)) else ""
     if any(is_image(file) for file in path.iterdir()):
         parent = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"

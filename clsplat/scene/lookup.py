@@ -79,7 +79,7 @@ def walk_folders(path: Path, depth: int) -> Iterator[tuple[Path, list[str]]]:
         yield folder, sorted(files)
 
 
-def unsupported_cameras(path: Path) -> str:
+def describe_unsupported_cameras(path: Path) -> str:
     """Return a sentence about an unsupported camera file of another program at or below `path`; "" if there is none."""
     folders = [(path.parent, [path.name])] if path.is_file() else walk_folders(path, 2)
     for folder, names in folders:

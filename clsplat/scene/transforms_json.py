@@ -16,7 +16,7 @@ from clsplat.core.errors import DataError, quote
 from clsplat.core.reading import read_json
 from clsplat.scene.camera import MAX_SIDE, MIN_FOCAL, Camera, Lens, intern_lens, panorama_lens
 from clsplat.scene.images import read_stored_size
-from clsplat.scene.lookup import FileLookup, Missing, safe_join, unsupported_cameras
+from clsplat.scene.lookup import FileLookup, Missing, describe_unsupported_cameras, safe_join
 from clsplat.scene.points import BELOW_MAX, MAX_VALUE, read_ply_table, read_points_ply
 from clsplat.scene.reader import Parts, Reader
 from clsplat.scene.scene import Background, PointCloud, Scene, every_nth, make_scene
@@ -405,7 +405,7 @@ class MultiscaleReader(Reader):
 
     def matches(self, path: Path) -> bool:
         file = path / METADATA_FILE
-        return file.is_file() and not unsupported_cameras(file)
+        return file.is_file() and not describe_unsupported_cameras(file)
 
     def read(self, path: Path, holdout: int) -> Scene:
         splits = read_json(path / METADATA_FILE, limit=MAX_BYTES)

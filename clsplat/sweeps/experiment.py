@@ -36,7 +36,7 @@ from clsplat.runs.opening import read_run_scene, resolve_choices
 from clsplat.runs.run_folder import Start, choose_start, find_free_folder
 from clsplat.runs.runner import require_same_inputs
 from clsplat.runs.state import Phase, RunState
-from clsplat.runs.status import summary
+from clsplat.runs.status import summarize_run
 from clsplat.runs.time_budget import Show, execute_within
 from clsplat.sweeps.cell import identify
 from clsplat.sweeps.compare.page import write_comparison
@@ -83,7 +83,7 @@ def run_pipeline(
                 execute(pipeline, run, start, show)
             else:
                 execute_within(minutes, pipeline, run, start, show, execute)
-        for line in summary(out):
+        for line in summarize_run(out):
             LOG.debug("%s", line)  # the caller prints it
 
 
@@ -174,7 +174,7 @@ class Job:
         if steps is not None:
             overrides = [*overrides, f"{state.steps_key}={steps}"]
             with suppress(ConfigError):  # which opening the run raises again
-                if note := state.note_on_longer_training():
+                if note := state.describe_longer_training():
                     LOG.warning("%s", note)
         return cls._open(str(out / PIPELINE), state, scene, overrides, "resume", execution)
 

@@ -96,7 +96,7 @@ def _attempt_state(attempt: CellAttempt, now: float) -> dict[str, Any]:
     return {"state": state, "silent": round(max(0.0, silence)), **progress, **worker, **failure}
 
 
-def overview_text(status: dict[str, Any]) -> str:
+def format_store_status(status: dict[str, Any]) -> str:
     """Format the result of `store_status` as text, one line per cell."""
     counts_text = ", ".join(f"{count} {state}" for state, count in sorted(status["counts"].items())) or "no cells"
     lines = [f"{status['store']}: {counts_text}"]

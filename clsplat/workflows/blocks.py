@@ -39,11 +39,11 @@ from clsplat.pipeline.execution import Execution
 from clsplat.pipeline.input_files import with_content_hashes
 from clsplat.pipeline.loading import Pipeline, load
 from clsplat.pipeline.matrix import Cell as MatrixCell
-from clsplat.runs.estimate import MAX_PER_PIXEL, max_gaussians, minutes_text, step_seconds
+from clsplat.runs.estimate import MAX_PER_PIXEL, format_minutes, max_gaussians, step_seconds
 from clsplat.runs.failures import Failures
 from clsplat.runs.model_file import path_setting, photo_folder, require_model
 from clsplat.runs.opening import read_run_scene, with_lengths
-from clsplat.runs.status import status_text
+from clsplat.runs.status import format_status
 from clsplat.stages.init import Init
 from clsplat.stages.optimize import Optimize
 from clsplat.sweeps.batch import Batch
@@ -305,18 +305,18 @@ def format_table(manifest: dict[str, Any]) -> str:
     times = [block["seconds"] for block in manifest["blocks"] if "seconds" in block]
     if not times:
         return text_table([HEADINGS, *map(_cells, manifest["blocks"]), scene_row])
-    rows = [[*_cells(block), minutes_text(seconds)] for block, seconds in zip(manifest["blocks"], times, strict=True)]
+    rows = [[*_cells(block), format_minutes(seconds)] for block, seconds in zip(manifest["blocks"], times, strict=True)]
     low, high = (sum(seconds) for seconds in zip(*times, strict=True))
-    total_row = [*scene_row, f"{minutes_text((low, high))}, one after another"]
+    total_row = [*scene_row, f"{format_minutes((low, high))}, one after another"]
     return f"{text_table([[*HEADINGS, TIME_HEADING], *rows, total_row])}\n{NOTE}"
 
 
-def status_table(status: dict[str, Any]) -> str:
+def format_status_table(status: dict[str, Any]) -> str:
     """Format the result of `blocks_status`, one line per run."""
     done_count = sum(part["state"] == "done" for part in status["parts"])
     lines = [f"{status['in_blocks']}: {status['state']}, {done_count} of {len(status['parts'])} runs are done"]
     for part in status["parts"]:
-        first_line = status_text(part).partition("\n")[0] if "run" in part else f"{part['name']}: {part['state']}"
+        first_line = format_status(part).partition("\n")[0] if "run" in part else f"{part['name']}: {part['state']}"
         lines.append(f"{first_line}; {part['message']}" if part.get("message") else first_line)
     return "\n  ".join(map(one_line, lines))
 

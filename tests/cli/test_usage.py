@@ -19,7 +19,7 @@ from clsplat.pipeline.loading import load
 from clsplat.pipeline.overrides import list_keys
 from clsplat.pipeline.recipes import copy, manual, summaries, summary
 from clsplat.runs.state import RunState
-from clsplat.runs.status import run_status, status_text
+from clsplat.runs.status import format_status, run_status
 from clsplat.training.records import Records
 from tests.support.commands import clsplat, process
 from tests.support.runs import train, write_status
@@ -269,14 +269,14 @@ def test_status_reads_only_files(finished, tmp_path):
     gone.wait()
     write_status(tmp_path, state="running", step=7, steps=9, process=gone.pid)
     (tmp_path / "metrics.jsonl").write_text('{"step": 5, "kind": "train", "loss": 0.25, "psnr": 20.0}\ncut')
-    assert status_text(run_status(RunState.read(tmp_path))) == (
+    assert format_status(run_status(RunState.read(tmp_path))) == (
         f"{tmp_path}: killed at step 7 of 9\n"
         f"  no checkpoint was saved; `clsplat resume {tmp_path}` starts it over\n"
         "  last report: step 5, loss 0.25, psnr 20"
     )
     matrix = {"state": "failed", "cells": 4, "done": 4, "failed": {"a": "no"}, "message": "1 of 4 cells failed"}
     write_status(tmp_path, **matrix)
-    assert "failed, 4 of 4 cells, 1 of them failed\n  1 of 4 cells failed\n" in status_text(
+    assert "failed, 4 of 4 cells, 1 of them failed\n  1 of 4 cells failed\n" in format_status(
         run_status(RunState.read(tmp_path))
     )
 

@@ -14,7 +14,7 @@ from clsplat.data_tools.video import write_frames
 from clsplat.pipeline import recipes
 from clsplat.pipeline.matrix import load_experiment
 from clsplat.pipeline.plugins import hash_plugin_files
-from clsplat.runs.status import summary
+from clsplat.runs.status import summarize_run
 from clsplat.scene import identity
 from clsplat.training import archive
 from tests.support.timeouts import failing
@@ -143,4 +143,4 @@ def test_binary_pipeline_is_not_copied(tmp_path):
 def test_damaged_metrics_are_one_sentence_after_a_run(text, tmp_path):
     (tmp_path / "metrics.json").write_text(text)
     with pytest.raises(DataError, match=r"metrics\.json: "):
-        summary(tmp_path)
+        summarize_run(tmp_path)

@@ -298,8 +298,8 @@ def test_damaged_model_is_refused_in_one_line(written, name):
 
 def test_tree_is_traversed_once_for_all_levels(written, monkeypatch):
     folder, _ = written
-    walks, real = [], streamed_sog._leaves
-    monkeypatch.setattr(streamed_sog, "_leaves", lambda path, tree: walks.append(path) or real(path, tree))
+    walks, real = [], streamed_sog._iterate_leaves
+    monkeypatch.setattr(streamed_sog, "_iterate_leaves", lambda path, tree: walks.append(path) or real(path, tree))
     assert streamed_sog.find_level_faults(folder / "lod-meta.json") == []
     assert len(walks) == 1
 

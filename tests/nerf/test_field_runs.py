@@ -22,7 +22,7 @@ from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
 from clsplat.runs.model_file import require_model
 from clsplat.runs.state import RunState
-from clsplat.runs.status import summary
+from clsplat.runs.status import summarize_run
 from clsplat.runs.time_budget import Rehearsal
 from clsplat.runs.verify import verify
 from clsplat.scene.camera import Camera
@@ -81,7 +81,7 @@ def test_field_trains_longer_with_more_steps(finished, tmp_path):
     assert RunState.read(tmp_path).steps_key == "optimize.steps"
     output = clsplat_command("resume", finished, "--steps", "14", "--dry-run").stdout
     assert "14 steps" in output
-    assert f"`clsplat resume {finished} --steps 24` trains longer" in "\n".join(summary(finished))
+    assert f"`clsplat resume {finished} --steps 24` trains longer" in "\n".join(summarize_run(finished))
 
 
 def test_training_lowers_the_loss(tiny_scene, tmp_path, pipeline):

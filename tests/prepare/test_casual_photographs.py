@@ -14,13 +14,13 @@ from clsplat.core.errors import DataError, shell_quote
 from clsplat.prepare import diagnosis as reasons_tool
 from clsplat.prepare import mapping
 from clsplat.prepare.cache import fingerprint
-from clsplat.prepare.database import image_names, open_database
+from clsplat.prepare.database import open_database, read_image_names
 from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unplaced
-from clsplat.prepare.features import FeatureOptions, find_features, sift
+from clsplat.prepare.features import FeatureOptions, detect_sift, find_features
 from clsplat.prepare.gather import gather, list_photographs, warnings_for
 from clsplat.prepare.mapping import map_cameras
 from clsplat.prepare.matching import match_features
-from clsplat.prepare.rotation_only import no_depth_reason
+from clsplat.prepare.rotation_only import explain_missing_depth
 from clsplat.scene.images import copy_exif, read_exif_exposure, read_exif_optics, read_gray, read_header, read_image
 from tests.support.pictures import blocks
 from tests.support.refusals import refusal
@@ -108,7 +108,7 @@ def test_photographs_share_cameras_by_size_and_lens(tmp_path, cameras, groups, c
     assert figures["cameras"] == groups
     with open_database(pycolmap, tmp_path / "out" / "database.db") as rows:
         images, cameras_found = rows.read_all_images(), rows.read_all_cameras()
-    assert [image.name for image in images] == image_names(pycolmap, tmp_path / "out" / "database.db")
+    assert [image.name for image in images] == read_image_names(pycolmap, tmp_path / "out" / "database.db")
     assert {image.camera_id for image in images} == set(range(1, groups + 1))
     if cameras == "auto":
         shared = {image.name: image.camera_id for image in images}
@@ -140,13 +140,13 @@ def test_features_are_at_the_spots(min_side):
     spots = [(40.0, 30.0), (110.25, 70.75), (60.5, 95.0)]
     for at in spots:
         pixels += 120 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 3.0**2))
-    keypoints, descriptors = sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=50, min_side=min_side))
+    keypoints, descriptors = detect_sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=50, min_side=min_side))
     for at in spots:
         assert np.linalg.norm(keypoints[:, :2] - at, axis=1).min() < 0.1
     assert descriptors.dtype == np.uint8
     assert descriptors.shape == (len(keypoints), 128)
     np.testing.assert_allclose((descriptors.astype(float) ** 2).sum(axis=1), 512**2, rtol=0.1)
-    assert len(sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=2))[0]) == 2
+    assert len(detect_sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=2))[0]) == 2
 
 
 # ---- photographs that cannot be placed
@@ -355,8 +355,8 @@ def test_copies_do_not_count_as_camera_motion(tmp_path, dense):
     wide = blocks(1, 400, 180)
     matches, _ = prepared(tmp_path, [wide[:, 30 * (number // 3) :][:, :240] for number in range(9)])
     pycolmap = pytest.importorskip("pycolmap")
-    assert no_depth_reason(pycolmap, matches / "database.db") == ""
-    assert "all the same" in no_depth_reason(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
+    assert explain_missing_depth(pycolmap, matches / "database.db") == ""
+    assert "all the same" in explain_missing_depth(pycolmap, matches / "database.db", {"00.png", "01.png", "02.png"})
 
 
 def test_model_counts_only_photographs_outside_larger_models(tmp_path):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from clsplat.core.errors import DataError
 from clsplat.formats.table import write as write_splats
 from clsplat.pipeline.file import SceneSettings
-from clsplat.prepare.inspect.facts import distortion
+from clsplat.prepare.inspect.facts import measure_distortion
 from clsplat.prepare.inspect.findings import Inspection
 from clsplat.prepare.inspect.page import MAX_NAMES, inspection_page
 from clsplat.runs.opening import RunScene
@@ -115,10 +115,10 @@ def test_blurred_or_differently_exposed_photographs_are_named(scene, tmp_path):
 
 
 def test_distortion_is_the_displacement_at_the_corner():
-    assert distortion(Lens(200, 100, "SIMPLE_RADIAL", (100.0, 100.0, 50.0, 0.1))) == pytest.approx(
+    assert measure_distortion(Lens(200, 100, "SIMPLE_RADIAL", (100.0, 100.0, 50.0, 0.1))) == pytest.approx(
         100 * 0.1 * np.hypot(1, 0.5) ** 3
     )
-    assert distortion(Lens(200, 100, "SIMPLE_RADIAL", (1e-300, 100.0, 50.0, 0.1))) is None
+    assert measure_distortion(Lens(200, 100, "SIMPLE_RADIAL", (1e-300, 100.0, 50.0, 0.1))) is None
 
 
 # ---- errors: what the reader refuses too

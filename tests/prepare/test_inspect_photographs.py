@@ -51,7 +51,7 @@ def test_few_photographs_get_advice(tmp_path):
     assert inspection.verdict.startswith("cameras are not known yet, and there are only 3 photos")
     for i in (1, 2):
         (tmp_path / f"{i}.png").unlink()
-    assert "has 1 photo; expected at least 3, better 30 or more" in finding_text(
+    assert "has 1 photo; expected at least 3, preferably 30 or more" in finding_text(
         Inspection.from_folder(tmp_path), "error"
     )
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from clsplat.prepare.database import open_database
-from clsplat.prepare.rotation_only import no_depth_reason
+from clsplat.prepare.rotation_only import explain_missing_depth
 
 WIDTH, HEIGHT, FOCAL = 1000, 750, 800.0
 
@@ -42,7 +42,7 @@ def matches_of(folder: Path, cameras: Sequence[tuple[float, float]]) -> Path:
 
 
 def reason_for(folder: Path, cameras: Sequence[tuple[float, float]]) -> str:
-    return no_depth_reason(pytest.importorskip("pycolmap"), matches_of(folder, cameras))
+    return explain_missing_depth(pytest.importorskip("pycolmap"), matches_of(folder, cameras))
 
 
 def test_rotating_camera_gives_no_depth(tmp_path):

@@ -22,7 +22,7 @@ from clsplat.prepare import undistort as undistort_tool
 from clsplat.prepare.features import FeatureOptions, find_features
 from clsplat.prepare.gather import list_photographs
 from clsplat.prepare.mapping import map_cameras, triangulate_pairs
-from clsplat.prepare.matching import Pairing, match_features, similar_pairs
+from clsplat.prepare.matching import Pairing, find_similar_pairs, match_features
 from clsplat.prepare.undistort import undistort_scene
 from clsplat.scene.camera import Camera, Lens
 from clsplat.scene.colmap_writer import write_model
@@ -197,16 +197,16 @@ def test_features_are_extracted_once_despite_a_kill(five, tmp_path, monkeypatch)
 import os, signal
 from pathlib import Path
 from clsplat.prepare import features
-find, calls = features.sift, []
+find, calls = features.detect_sift, []
 def counted(*a):
     calls.append(a)
     return find(*a) if len(calls) < 3 else os.kill(os.getpid(), signal.SIGKILL)
-features.sift = counted
+features.detect_sift = counted
 features.find_features(Path({str(five)!r}), Path({str(tmp_path / "half")!r}), features.FeatureOptions(320, 500))
 """
     assert subprocess.run([sys.executable, "-c", killed], cwd=ROOT).returncode == -signal.SIGKILL
-    sift, sizes = features_tool.sift, []
-    monkeypatch.setattr(features_tool, "sift", lambda *a: (sizes.append(a[0].shape), sift(*a))[1])
+    detect_sift, sizes = features_tool.detect_sift, []
+    monkeypatch.setattr(features_tool, "detect_sift", lambda *a: (sizes.append(a[0].shape), detect_sift(*a))[1])
     find_features(five, tmp_path / "half", FeatureOptions(320, 500))
     assert len(sizes) == 3, "two of five were kept"
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
@@ -225,7 +225,7 @@ def test_incomplete_database_is_rebuilt(five, tmp_path):
         shutil.copy(five / name, tmp_path / "half" / "images")
     database = str(tmp_path / "half" / "database.db")
     pycolmap.Database.open(database).close()
-    pycolmap.import_images(database, str(five), image_names=first)
+    pycolmap.import_images(database, str(five), read_image_names=first)
     find_features(five, tmp_path / "half", FeatureOptions(320, 500))
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
 
@@ -396,9 +396,9 @@ def test_similar_photographs_are_paired(rng):
     """Each shares half of its features with the next one, in a ring."""
     halves = rng.random((6, 300, 128), dtype=np.float32)
     tables = [np.concatenate([halves[i], halves[(i + 1) % 6]]) for i in range(6)]
-    assert similar_pairs(tables, 2) == [(0, 1), (0, 5), (1, 2), (2, 3), (3, 4), (4, 5)]
-    assert similar_pairs([*tables[:2], np.empty((0, 128), np.float32)], 1)[0] == (0, 1)
-    assert similar_pairs([np.empty((0, 128), np.float32)] * 3, 1) == [(0, 1), (0, 2)], "of plain ones, the first"
+    assert find_similar_pairs(tables, 2) == [(0, 1), (0, 5), (1, 2), (2, 3), (3, 4), (4, 5)]
+    assert find_similar_pairs([*tables[:2], np.empty((0, 128), np.float32)], 1)[0] == (0, 1)
+    assert find_similar_pairs([np.empty((0, 128), np.float32)] * 3, 1) == [(0, 1), (0, 2)], "of plain ones, the first"
 
 
 # ---- the scene written

@@ -18,11 +18,11 @@ TEXTS = {  # what turns results into lines of text, which the commands print
     "clsplat.pipeline.files": {"shipped_pipelines"},  # for completion, which must be fast
     "clsplat.pipeline.recipes": {"manual_text", "summaries_text"},
     "clsplat.prepare.inspect.findings": {"show"},
-    "clsplat.runs.status": {"status_text", "summary"},
+    "clsplat.runs.status": {"format_status", "summarize_run"},
     "clsplat.runs.verify": {"format_files", "verdict"},
-    "clsplat.sweeps.status": {"overview_text"},
+    "clsplat.sweeps.status": {"format_store_status"},
     "clsplat.workflows.align": {"format_table"},
-    "clsplat.workflows.blocks": {"status_table", "format_table"},
+    "clsplat.workflows.blocks": {"format_status_table", "format_table"},
     "clsplat.workflows.compress": {"format_table"},
     "clsplat.workflows.lod": {"format_table"},
 }

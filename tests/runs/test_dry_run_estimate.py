@@ -13,7 +13,7 @@ from clsplat.pipeline.matrix import Cell
 from clsplat.prepare.matching import MAX_EXHAUSTIVE, max_pair_count
 from clsplat.runs import estimate as module
 from clsplat.runs.describe import describe
-from clsplat.runs.opening import check_preparation, expected_measures, photo_names
+from clsplat.runs.opening import check_preparation, expect_measures, list_photo_names
 from clsplat.runs.state import RunState
 from clsplat.stages.optimize import Optimize
 from clsplat.sweeps.batch import pending_cell
@@ -37,9 +37,9 @@ def expected(pipeline: str, photos: Path, *sets: str) -> list[str]:
     asked = load(pipeline, [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
     planned = asked.preparation(out)
-    names = photo_names(asked, planned, out)
+    names = list_photo_names(asked, planned, out)
     device = SimpleNamespace(info=SimpleNamespace(units=2))
-    return module.estimate_time(asked, planned, names, expected_measures(asked, names), device, None)  # type: ignore[arg-type]
+    return module.estimate_time(asked, planned, names, expect_measures(asked, names), device, None)  # type: ignore[arg-type]
 
 
 def test_time_estimates_scale_with_the_work(photos):
@@ -81,10 +81,10 @@ def test_estimated_growth_follows_the_limit(photos):
 def test_unprepared_photographs_give_the_training_count(photos, sets, training):
     pipeline = load("photos", [f"scene.path='{photos}'", *sets])
     out = photos.parent / "runs" / "a"
-    names = photo_names(pipeline, pipeline.preparation(out), out)
+    names = list_photo_names(pipeline, pipeline.preparation(out), out)
     assert len(names) == COUNT
-    assert expected_measures(pipeline, names).photograph_count == training
-    assert expected_measures(pipeline, []) is None
+    assert expect_measures(pipeline, names).photograph_count == training
+    assert expect_measures(pipeline, []) is None
 
 
 def as_cell(asked, state, device, start):

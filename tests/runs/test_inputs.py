@@ -390,7 +390,7 @@ def test_dry_run_of_photographs_is_refused_like_the_run(scene, tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     for more in (["--dry-run"], []):
         done = command("run", "photos", "--scene", folder, *more, expect=3)
-        assert "; expected at least 3, better 30 or more" in done.stderr
+        assert "; expected at least 3, preferably 30 or more" in done.stderr
         if more:
             assert not (tmp_path / "runs").exists()
 

@@ -159,8 +159,8 @@ PHASES: dict[str, tuple[Phase, dict[str, str]]] = {
     "a status": (Phase.PREPARING, {"status.json": '{"state": "preparing"}'}),
     "a pipeline": (Phase.BEGUN, {"pipeline.yaml": ""}),
     "a checkpoint": (Phase.BEGUN, {"inputs.json": "{}", "checkpoints/step_000001.npz": ""}),
-    "no state": (Phase.STATELESS, {"pipeline.yaml": "", "inputs.json": "{}"}),
-    "a damaged status": (Phase.STATELESS, {"pipeline.yaml": "", "inputs.json": "{}", "status.json": "["}),
+    "no state": (Phase.LOST_STATE, {"pipeline.yaml": "", "inputs.json": "{}"}),
+    "a damaged status": (Phase.LOST_STATE, {"pipeline.yaml": "", "inputs.json": "{}", "status.json": "["}),
     "an end": (Phase.DONE, {"status.json": DONE}),
 }
 

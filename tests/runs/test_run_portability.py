@@ -11,7 +11,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.gaussians.model import load
 from clsplat.prepare.gather import summarize_placement
 from clsplat.runs.model_file import ModelSource, find_run, photo_folder
-from clsplat.runs.status import summary
+from clsplat.runs.status import summarize_run
 from clsplat.sweeps.experiment import Job
 from tests.support.html_page import Page
 from tests.support.runs import digest, steps_saved, train
@@ -87,7 +87,7 @@ def test_finished_run_without_checkpoints_is_not_retrained(tiny_scene, tmp_path)
 
 
 def test_summary_lists_metrics_and_files(done, tiny_scene):
-    lines = summary(done)
+    lines = summarize_run(done)
     assert lines[0].startswith("test PSNR ")
     assert f"  scene    {tiny_scene}" in lines
     assert f"  model    {done}/models/last.ply" in lines
@@ -101,7 +101,7 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
     folder = shutil.copytree(done, tmp_path / "run")
     metrics = json.loads((folder / "metrics.json").read_text())
     (folder / "metrics.json").write_text(json.dumps({**metrics, "overfit": True}))
-    assert summary(folder)[-1].endswith("in a browser; the model overfits: add photos")
+    assert summarize_run(folder)[-1].endswith("in a browser; the model overfits: add photos")
 
 
 def test_summary_names_missing_photographs(done, tmp_path):
@@ -113,7 +113,7 @@ def test_summary_names_missing_photographs(done, tmp_path):
     (tmp_path / "metrics.json").write_text(
         json.dumps({**metrics, "preparation": FOUND | {"undistort": {"seconds": 7.2}}})
     )
-    text = "\n".join(summary(tmp_path))
+    text = "\n".join(summarize_run(tmp_path))
     assert "; 32 of 33 photos placed" in text
     assert "undistort 7 s" in text
 

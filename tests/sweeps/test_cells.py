@@ -20,7 +20,7 @@ from clsplat.sweeps.batch import copy_result
 from clsplat.sweeps.cell import Scenes
 from clsplat.sweeps.devices import DeviceSlot
 from clsplat.sweeps.engines import CellLost, Dispatcher, InlineEngine, PendingCell
-from clsplat.sweeps.status import overview_text, store_status
+from clsplat.sweeps.status import format_store_status, store_status
 from clsplat.sweeps.store import ATTEMPTS, LEASE, MANIFEST, BitsMismatch, CellAttempt, Store
 from clsplat.sweeps.task import CellOptions, Outcome, run_cell
 from tests.support.cells import CELL, SPEC, WRITES, Fake, command, keys, pending_cells
@@ -432,7 +432,7 @@ def test_store_state_is_read_from_files(store, options):
         "on": "running",
         "new": "waiting",
     }
-    text = overview_text(result)
+    text = format_store_status(result)
     store.folder(cells[1].key).begin("w", options.since)
     assert store_status(store.root)["counts"] == {"published": 1, "running": 2, "waiting": 1}, "it is tried again"
     store.folder(cells[1].key).give_up(2, "of another process, which has tried it too")

@@ -11,7 +11,7 @@ from clsplat.runs.opening import undistorted_folder
 from clsplat.runs.state import RunState
 from clsplat.sweeps.batch import copy_result
 from clsplat.sweeps.experiment import check_matrix_folder
-from clsplat.sweeps.status import overview_text, store_status
+from clsplat.sweeps.status import format_store_status, store_status
 from clsplat.sweeps.task import run_cell
 from tests.support.cells import CELL, WRITES, command
 from tests.support.commands import clsplat
@@ -114,14 +114,14 @@ def test_damaged_values_of_a_store_count_as_absent(store, options):
     for value in ODD:
         for key in ("seconds", "host", "device", "worker"):
             (folder.result / "manifest.json").write_text(json.dumps({**manifest, key: value}))
-            overview_text(store_status(store.root))
+            format_store_status(store_status(store.root))
         for key in ("since", "exit_code", "from", "time", "host"):
             (attempt.path / "lease.json").write_text(json.dumps({"exit_code": 6, key: value}))
             other.failures(0.0)
-            overview_text(store_status(store.root))
+            format_store_status(store_status(store.root))
         (attempt.path / "lease.json").write_text(json.dumps({"from": f"step_{'9' * 5000}.npz", "exit_code": 6}))
         other.failures(0.0)
         for steps in ({"optimize": {"steps": value}}, value, {"optimize": value}):
             spec = {"pipeline": {"name": value, "seed": value, "stages": [steps]}, "bits": value}
             (other.path / "spec.json").write_text(json.dumps(spec))
-            overview_text(store_status(store.root))
+            format_store_status(store_status(store.root))

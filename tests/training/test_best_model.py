@@ -15,7 +15,7 @@ from clsplat.formats.splats import PARAMETERS
 from clsplat.formats.table import read as read_ply
 from clsplat.pipeline.loading import load
 from clsplat.runs.runner import with_refit_steps
-from clsplat.runs.status import summary
+from clsplat.runs.status import summarize_run
 from clsplat.stages.report import NAMES, is_overfit, overfitting_note
 from clsplat.sweeps.experiment import Job
 from clsplat.training import best_model, checkpoint
@@ -119,8 +119,8 @@ def test_metrics_are_those_of_the_best_model(best_run):
     assert actual["train"]["1"]["psnr"] == actual["kept"]["train"] == psnr_of(best_run, "train")[BEST]
     assert actual["train"]["1"]["views"] == 6
     assert actual["test"]["1"]["psnr"] == psnr_of(best_run, "test")[BEST]
-    assert f"best     model of step {BEST}" in "\n".join(summary(best_run))
-    assert summary(best_run)[-1].endswith("in a browser"), "more steps were no better"
+    assert f"best     model of step {BEST}" in "\n".join(summarize_run(best_run))
+    assert summarize_run(best_run)[-1].endswith("in a browser"), "more steps were no better"
 
 
 def test_report_shows_three_splits_and_the_best_step(best_run):

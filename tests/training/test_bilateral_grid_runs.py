@@ -21,7 +21,7 @@ from clsplat.opencl.device import Device
 from clsplat.pipeline import plugins
 from clsplat.pipeline.loading import load
 from clsplat.render.workspace import Workspace
-from clsplat.runs.status import summary
+from clsplat.runs.status import summarize_run
 from clsplat.training import archive, checkpoint, memory
 from clsplat.training.modules.base import attach_modules, read_color_model
 from clsplat.training.modules.bilateral_grid import BilateralGrid, grid_bytes
@@ -145,7 +145,7 @@ def test_grids_are_written_and_metrics_use_gains(with_grids, few_steps, tmp_path
     assert measured["psnr_color"] == pytest.approx(evaluate(with_grids)["test"]["1"]["psnr_color"], abs=1e-6)
     assert read_color_model(with_grids / "point_cloud.ply") == Gain()
     assert digest(with_grids) != digest(few_steps)
-    assert ["colors", f"{with_grids}/view_colors.json"] in [line.split() for line in summary(with_grids)]
+    assert ["colors", f"{with_grids}/view_colors.json"] in [line.split() for line in summarize_run(with_grids)]
 
 
 @pytest.mark.slow

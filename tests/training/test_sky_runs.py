@@ -20,7 +20,7 @@ from clsplat.photos.sky_detection import SkyEvidence, detect_sky, panorama
 from clsplat.pipeline.loading import load, without_auto
 from clsplat.render.backdrops import Auto
 from clsplat.runs.state import RunState
-from clsplat.runs.status import summary
+from clsplat.runs.status import summarize_run
 from clsplat.scene.camera import Camera
 from clsplat.scene.colmap_writer import write_model
 from clsplat.scene.images import write_image
@@ -258,7 +258,7 @@ def test_exported_splats_show_the_sky_without_its_file(yard, sky_run, tmp_path, 
     assert np.mean(scores) > 36
     count = f"{len(trained):,} Gaussians and 10,000 of the sky"
     assert json.loads((sky_run / "metrics.json").read_text())["sky_gaussians"] == 10_000
-    assert count in summary(sky_run)[0]
+    assert count in summarize_run(sky_run)[0]
     assert count in (sky_run / "report.html").read_text()
     convert([sky_run], tmp_path / "other.ply")
     assert len(clsplat.load(tmp_path / "other.ply")) == len(trained) + 10_000
@@ -278,7 +278,7 @@ def test_finished_run_exports_its_sky_again(sky_run, tmp_path):
             "point_cloud.ply",
             *(["point_cloud_without_sky.ply"] if sky == "splats" else []),
         ]
-        assert ("of the sky" in summary(out)[0]) == (sky == "splats")
+        assert ("of the sky" in summarize_run(out)[0]) == (sky == "splats")
         np.testing.assert_array_equal(clsplat.load(out).sky.texels, clsplat.load(sky_run).sky.texels)
     for name in ("point_cloud.ply", "point_cloud_without_sky.ply", "point_cloud_sky.json"):
         assert sha256(out / name) == sha256(sky_run / name)

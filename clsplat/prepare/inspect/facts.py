@@ -97,9 +97,9 @@ def compare_photos(
     median = np.median([photo.sharpness for photo in photos.values()], axis=0) if photos else np.zeros(2)
     return ComparisonFacts(
         blurred=[name for name, photo in photos.items() if is_blurred(photo.sharpness, median) and not photo.is_blank],
-        same=_duplicates(list(photos), [photo.thumbnail for photo in photos.values()]),
+        same=_find_duplicates(list(photos), [photo.thumbnail for photo in photos.values()]),
         jumps=[jump for jump in stops if jump[2] > MAX_STOPS],
-        steps=_brightness_steps(
+        steps=_find_brightness_steps(
             {name: photo.brightness for name, photo in photos.items()}, {name for name, _ in values}
         ),
         unreadable={
@@ -120,7 +120,7 @@ def _measure_photo(file: Path) -> PhotographMeasures | DataError:
     return PhotographMeasures(sharpness_values(gray), brightness, thumbnail.astype(np.float32).ravel(), is_blank(gray))
 
 
-def _brightness_steps(
+def _find_brightness_steps(
     brightness: Mapping[str, NDArray[np.float64]], names_with_exposure: Container[str]
 ) -> list[tuple[str, str, float]]:
     """Return adjacent photographs whose mean and median brightness both differ by a factor above MAX_BRIGHTNESS_RATIO.
@@ -138,7 +138,7 @@ def _brightness_steps(
     return steps
 
 
-def _duplicates(names: Sequence[str], thumbnails: Sequence[NDArray[np.float32]]) -> list[list[str]]:
+def _find_duplicates(names: Sequence[str], thumbnails: Sequence[NDArray[np.float32]]) -> list[list[str]]:
     """Return groups of photographs with nearly equal thumbnails; thumbnails without contrast are skipped."""
     groups: list[list[int]] = []
     for i, thumbnail in enumerate(thumbnails):
@@ -177,12 +177,12 @@ def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.float
     assert parts.points is not None
     positions = parts.points.positions
     is_finite = (np.abs(positions) < MAX_VALUE).all(axis=1)
-    errors = _errors(parts, np.asarray(is_finite))
+    errors = _point_errors(parts, np.asarray(is_finite))
     finite_positions = positions[is_finite].astype(np.float64)
     distance = np.linalg.norm(finite_positions - np.median(centers, axis=0), axis=1) if len(centers) else np.empty(0)
     sample = finite_positions[:: max(1, -(-len(finite_positions) // SAMPLE_SIZE))]
     views = list(parts.scene.views) if parts.scene else parts.views  # with the faces of wide photographs
-    two_view_fraction, behind_fraction = _coverage(sample, views) if len(sample) and views else (None, None)
+    two_view_fraction, behind_fraction = _measure_coverage(sample, views) if len(sample) and views else (None, None)
     return PointFacts(
         count=len(positions),
         not_finite=int(np.count_nonzero(~is_finite)),
@@ -194,7 +194,7 @@ def measure_points(parts: Parts, extent: float | None, centers: NDArray[np.float
     )
 
 
-def _errors(parts: Parts, is_finite: NDArray[np.bool_]) -> NDArray[np.floating]:
+def _point_errors(parts: Parts, is_finite: NDArray[np.bool_]) -> NDArray[np.floating]:
     """Return the reprojection errors in px at the full size, computed from observations or read from the file."""
     errors = reprojection_errors(parts.scene.tracks, parts.scene.views) if parts.scene else None
     if errors is not None:
@@ -205,7 +205,7 @@ def _errors(parts: Parts, is_finite: NDArray[np.bool_]) -> NDArray[np.floating]:
     return valid_errors if len(np.unique(valid_errors)) > 1 else np.empty(0)  # equal errors are a placeholder
 
 
-def _coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
+def _measure_coverage(points: NDArray[np.float64], views: Sequence[View]) -> tuple[float, float]:
     """Return the fractions of points, [M, 3], that project into at least two views, and that are behind all views."""
     visible_counts, ever_in_front = np.zeros(len(points), int), np.zeros(len(points), bool)
     for view in views:
@@ -335,8 +335,8 @@ def measure_dataset(parts: Parts) -> Facts:
         unregistered=[_relative_path(file, parts) for file in parts.disk_files if file not in listed_files],
         folders=len({file.parent for file in expected}),
         submodels=parts.submodels,
-        cameras=_cameras(parts),
-        photos=_photographs(parts, set(missing_files)),
+        cameras=_measure_cameras(parts),
+        photos=_measure_photographs(parts, set(missing_files)),
         comparison=compare_views(parts, set(missing_files)),
         capture=None if views else measure_capture(parts.disk_files),
         points=measure_points(parts, extent, centers) if parts.points else None,
@@ -359,7 +359,7 @@ def measure_dataset(parts: Parts) -> Facts:
     )
 
 
-def distortion(lens: Lens) -> float | None:
+def measure_distortion(lens: Lens) -> float | None:
     """Return the largest displacement by the lens along the border, in px.  None if it is not finite."""
     camera, fractions = lens.camera, np.linspace(0, 1, BORDER_POINTS)
     zeros, ones = np.zeros(BORDER_POINTS), np.ones(BORDER_POINTS)
@@ -388,7 +388,7 @@ def _equal_groups(names: Sequence[str], keys: Iterable[object]) -> list[list[str
     return [group for group in groups.values() if len(group) > 1]
 
 
-def _cameras(parts: Parts) -> list[CameraFacts]:
+def _measure_cameras(parts: Parts) -> list[CameraFacts]:
     views_by_camera: dict[object, list[View]] = defaultdict(list)
     for view in parts.views:
         views_by_camera[(view.lens or view.camera, parts.models.get(view.name))].append(view)
@@ -401,7 +401,7 @@ def _cameras(parts: Parts) -> list[CameraFacts]:
         is_centered = 0 <= original.cx <= original.width and 0 <= original.cy <= original.height
         size, focal = (original.width, original.height), (original.fx, original.fy)
         faces = len(lens.faces) if lens and lens.is_wide else 0
-        displacement, area_fraction = (0.0, 1.0) if faces or not lens else (distortion(lens), area_fraction)
+        displacement, area_fraction = (0.0, 1.0) if faces or not lens else (measure_distortion(lens), area_fraction)
         cameras.append(CameraFacts(len(views), model, *size, focal, displacement, area_fraction, is_centered, faces))
     return sorted(cameras, key=lambda facts: -facts.views)
 
@@ -418,7 +418,7 @@ def measure_capture(files: Sequence[Path]) -> CaptureFacts:
     return CaptureFacts(dict(sizes.most_common()), dict(cameras.most_common()), located_count)
 
 
-def _photographs(parts: Parts, missing_files: set[Path]) -> PhotographFacts:
+def _measure_photographs(parts: Parts, missing_files: set[Path]) -> PhotographFacts:
     views = parts.views
     decoded_files = decode_all(view for view in views if view.image_path not in missing_files)
     blank, unusable_reason = list[str](), ""
@@ -480,10 +480,10 @@ def read_parts(path: Path) -> Parts:
         _list_photographs(parts)
     elif parts.image_folder or not parts.expected_files:
         folder = parts.image_folder or path / "images"
-        parts.disk_files = list(image_files(folder if folder.is_dir() else path, recursive=True))
+        parts.disk_files = list(list_image_files(folder if folder.is_dir() else path, recursive=True))
     else:
         folders = sorted({file.parent for file in parts.expected_files})
-        parts.disk_files = [file for folder in folders for file in image_files(folder, recursive=False)]
+        parts.disk_files = [file for folder in folders for file in list_image_files(folder, recursive=False)]
     if parts.scene:  # list_parts may also list views that belong to no split
         parts.views = list({view.name: view for view in map(View.full_photograph, parts.scene.views)}.values())
     return parts
@@ -491,7 +491,7 @@ def read_parts(path: Path) -> Parts:
 
 def _list_photographs(parts: Parts) -> None:
     """List the photographs in a folder without cameras, and the warnings that preparing them would log."""
-    parts.disk_files = list(image_files(parts.path, recursive=True))
+    parts.disk_files = list(list_image_files(parts.path, recursive=True))
     with captured_log(logging.WARNING) as parts.warnings:
         try:
             list_photographs(parts.path)
@@ -500,7 +500,7 @@ def _list_photographs(parts: Parts) -> None:
                 parts.refusal = str(error)
 
 
-def image_files(folder: Path, recursive: bool) -> Iterator[Path]:
+def list_image_files(folder: Path, recursive: bool) -> Iterator[Path]:
     """Yield the image files in a folder, sorted by name; with `recursive`, also the files in its subfolders."""
     for parent, folders, names in os.walk(folder):
         folders[:] = sorted(f for f in folders if not f.startswith(".")) if recursive else []

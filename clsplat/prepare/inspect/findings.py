@@ -65,11 +65,11 @@ def check_photo_folder(facts: Facts) -> Iterator[Finding]:
 def _check_capture(facts: Facts, readable_count: int) -> Iterator[Finding]:
     """Yield findings about photographs without cameras.  readable_count: the number of readable photographs."""
     if readable_count < MIN_VIEWS:
-        fault = f"there {_are(readable_count, 'photo', 'only ')}, often too few to find the cameras"
+        fault = f"there {_count_with_verb(readable_count, 'photo', 'only ')}, often too few to find the cameras"
         yield Finding("warning", fault, TAKE_MORE)
     if blank := facts.comparison.blank:
         is_all_blank = len(blank) == readable_count
-        blank_text = f"{_are(len(blank), 'photo')} black or of a single color"
+        blank_text = f"{_count_with_verb(len(blank), 'photo')} black or of a single color"
         fault = "all photos are blank" if is_all_blank else blank_text
         yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")
 
@@ -86,7 +86,7 @@ MIN_KEPT = 0.6  # fraction of a photograph
 FOCAL_RANGE = (0.2, 20.0)  # focal length / image width, 136 to 3 degrees
 
 
-def findings(facts: Facts) -> list[Finding]:
+def derive_findings(facts: Facts) -> list[Finding]:
     """Return the findings about a dataset, errors first, then warnings and notes."""
     checks = (
         check_photo_folder,
@@ -106,7 +106,7 @@ def findings(facts: Facts) -> list[Finding]:
 def check_view_count(train: int) -> Iterator[Finding]:
     """Yield a warning if a scene has few training views.  train: the number of training views."""
     if train < MIN_VIEWS:
-        fault = f"there {_are(train, 'training view', 'only ')}"
+        fault = f"there {_count_with_verb(train, 'training view', 'only ')}"
         yield Finding("warning", fault, "expect floaters and blur far from the photos; take 30 or more")
 
 
@@ -132,14 +132,14 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
         fault, _, remedy = photographs.unusable_reason.removeprefix(f"{facts.path}: ").rpartition("; ")
         yield Finding("error", fault, remedy)
     if photographs.blank:
-        fault = f"{_are(len(photographs.blank), 'photo')} black, of a single color, or transparent"
+        fault = f"{_count_with_verb(len(photographs.blank), 'photo')} black, of a single color, or transparent"
         yield Finding("warning", f"{fault} ({_join(photographs.blank)})", "remove or export them again")
     if photographs.cut:
         fault = f"the end is missing from {pluralize(len(photographs.cut), 'image file')} ({_join(photographs.cut)})"
         yield Finding("error", fault, "copy them again")
     if photographs.misfits:
         sizes = [f"{name} is {size}" for name, size in photographs.misfits.items()]
-        fault = f"{_are(len(sizes), 'image file')} not the size of the camera ({_join(sizes, 2)})"
+        fault = f"{_count_with_verb(len(sizes), 'image file')} not the size of the camera ({_join(sizes, 2)})"
         remedy = "use the images that the cameras were calibrated on"
         if len(photographs.on_side) == len(sizes):
             remedy = "width and height are swapped: " + remedy
@@ -156,7 +156,7 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
         if facts.registered:
             yield Finding("warning" if is_serious else "note", fault, remedy)
     if photographs.exif_turned:
-        fault = f"{_are(len(photographs.exif_turned), 'photo')} rotated by EXIF"
+        fault = f"{_count_with_verb(len(photographs.exif_turned), 'photo')} rotated by EXIF"
         yield Finding(
             "note", fault, "clsplat reads the pixels as stored, as COLMAP does, so renders may be rotated too"
         )
@@ -170,7 +170,7 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
 def _check_comparison(facts: Facts) -> Iterator[Finding]:
     blurred, jumps = facts.comparison.blurred, facts.comparison.jumps
     if blurred:
-        fault = f"{_are(len(blurred), 'photo')} blurred ({_join(blurred)})"
+        fault = f"{_count_with_verb(len(blurred), 'photo')} blurred ({_join(blurred)})"
         yield Finding("warning", fault, "remove or retake them: the model learns the blur")
     for names in facts.comparison.same[:MAX_NAMES]:
         yield Finding("note", f"{_join(names)} look the same", "one of them is enough")
@@ -180,7 +180,9 @@ def _check_comparison(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", fault, "--set optimize.modules.exposure={} gives each photo its own exposure")
     if steps := facts.comparison.steps:
         examples = _join([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
-        fault = f"{_are(len(steps), 'photo')} more than twice as bright or dark as the one before ({examples})"
+        fault = (
+            f"{_count_with_verb(len(steps), 'photo')} more than twice as bright or dark as the one before ({examples})"
+        )
         remedy = "without exposures in EXIF, --set optimize.modules.exposure={} fits the exposure of each photo"
         yield Finding("note", fault, remedy)
 
@@ -220,9 +222,8 @@ def _check_poses(facts: Facts) -> Iterator[Finding]:
         fault = "all cameras are at the same position"
         yield Finding("warning", fault, "they show no depth; take photos from different positions")
     if facts.outlier_cameras:
-        fault = (
-            f"{_are(len(facts.outlier_cameras), 'camera')} far away from all others ({_join(facts.outlier_cameras)})"
-        )
+        count = _count_with_verb(len(facts.outlier_cameras), "camera")
+        fault = f"{count} far away from all others ({_join(facts.outlier_cameras)})"
         yield Finding(
             "warning", fault, "the pose is probably wrong; remove the image from the dataset or register it again"
         )
@@ -244,13 +245,13 @@ def _check_points(facts: Facts) -> Iterator[Finding]:
             yield Finding("note", "there are no points", remedy)
         return
     if points.count < MIN_POINTS:
-        fault = f"there {_are(points.count, 'point', 'only ')}"
+        fault = f"there {_count_with_verb(points.count, 'point', 'only ')}"
         yield Finding("warning", fault, "also try --set init.source=random")
     if points.not_finite:
-        fault = f"{_are(points.not_finite, 'point')} not finite"
+        fault = f"{_count_with_verb(points.not_finite, 'point')} not finite"
         yield Finding("warning", fault, "they are ignored; the file may be damaged: export it again")
     if points.distant:
-        fault = f"{_are(points.distant, 'point')} more than {MAX_DISTANCE:g} times the cameras' extent away"
+        fault = f"{_count_with_verb(points.distant, 'point')} more than {MAX_DISTANCE:g} times the cameras' extent away"
         yield Finding("note", fault, "they are usually sky or wrong matches, and become very large Gaussians")
     if not facts.refusal:
         yield from _check_coverage(points)
@@ -271,7 +272,7 @@ def _check_coverage(points: PointFacts) -> Iterator[Finding]:
         yield Finding("warning", f"only {100 * points.in_two:.0f} % of the points project into two or more views", axes)
 
 
-def _are(count: int, word: str, prefix: str = "") -> str:
+def _count_with_verb(count: int, word: str, prefix: str = "") -> str:
     """Return a count with a noun and a verb, such as `3 views are`, or `are only 3 views` with a prefix."""
     verb = "is" if count == 1 else "are"
     return f"{verb} {prefix}{pluralize(count, word)}" if prefix else f"{pluralize(count, word)} {verb}"
@@ -294,7 +295,7 @@ class Inspection:
         """Inspect the dataset in a folder.  Raises DataError only if the folder does not exist."""
         parts = read_parts(path)
         facts = measure_dataset(parts)
-        return cls(parts, facts, findings(facts))
+        return cls(parts, facts, derive_findings(facts))
 
     @property
     def is_trainable(self) -> bool:
@@ -340,10 +341,10 @@ MAX_CAMERAS = 4  # number of cameras to list
 def summarize(facts: Facts) -> dict[str, str]:
     """Return the main facts as a dict from labels to lines of text."""
     fallback = "photos without cameras" if facts.is_unplaced else "none found"
-    lines = {"dataset": facts.kind if facts.kind != "none" else fallback, "images": _image_counts(facts)}
+    lines = {"dataset": facts.kind if facts.kind != "none" else fallback, "images": _format_image_counts(facts)}
     if capture := facts.capture:
-        lines["sizes"] = _counts(capture.sizes)
-        lines["cameras by EXIF"] = _counts(capture.cameras)
+        lines["sizes"] = _format_counts(capture.sizes)
+        lines["cameras by EXIF"] = _format_counts(capture.cameras)
         lines["GPS positions"] = f"{capture.located}" if capture.located else "none"
         comparison = facts.comparison
         lines["comparison"] = f"{len(comparison.blurred)} blurred, {len(comparison.same)} duplicates"
@@ -356,7 +357,9 @@ def summarize(facts: Facts) -> dict[str, str]:
     if len(facts.submodels) > 1:
         lines["models"] = ", ".join(f"{name} ({pluralize(count, 'image')})" for name, count in facts.submodels.items())
     for i, camera in enumerate(facts.cameras[:MAX_CAMERAS]):
-        lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = camera_text(camera)
+        lines["camera" if len(facts.cameras) == 1 else f"camera {i + 1} of {len(facts.cameras)}"] = describe_camera(
+            camera
+        )
     if facts.extent is not None:
         lines["extent"] = f"{facts.extent:.4g} scene units, of the cameras"
         if facts.outlier_cameras:
@@ -377,12 +380,12 @@ def summarize(facts: Facts) -> dict[str, str]:
     return lines
 
 
-def _counts(counts: Mapping[str, int]) -> str:
+def _format_counts(counts: Mapping[str, int]) -> str:
     """Format the keys as a list, each followed by its count if there are several keys."""
     return _join([f"{name} ({count})" if len(counts) > 1 else name for name, count in counts.items()])
 
 
-def camera_text(camera: CameraFacts) -> str:
+def describe_camera(camera: CameraFacts) -> str:
     """Describe a camera in a line of text: model, size, focal length, distortion, and number of views."""
     fx, fy = camera.focal
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
@@ -393,7 +396,7 @@ def camera_text(camera: CameraFacts) -> str:
     return f"{camera.model} {size}, focal length {focal} px{lens}; {pluralize(camera.views, 'view')}"
 
 
-def _image_counts(facts: Facts) -> str:
+def _format_image_counts(facts: Facts) -> str:
     if not facts.registered:
         return f"{facts.on_disk} on disk"
     parts = [f"{facts.registered} with a pose"]
