@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # the command line starts without OpenCL
     from clsplat.opencl.device import Device
     from clsplat.prepare.inspect.findings import Inspection
 
-ScheduleName = Literal["auto", "wide", "simt"]  # wide for CPUs, simt for GPUs
+ScheduleName = Literal["auto", "simt", "simt16", "wide"]  # wide for CPUs, the others for GPUs
 
 
 def devices() -> list[dict[str, Any]]:

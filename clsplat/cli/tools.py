@@ -125,7 +125,9 @@ def bench(
     against: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Compare with the JSON output of an earlier `clsplat bench`.")
     ] = None,
-    schedule: Annotated[Literal["auto", "wide", "simt"], typer.Option(help="wide for CPUs, simt for GPUs.")] = "auto",
+    schedule: Annotated[
+        Literal["auto", "simt", "simt16", "wide"], typer.Option(help="wide for CPUs; simt and simt16 for GPUs.")
+    ] = "auto",
     device: DeviceOption = None,
 ) -> None:
     """Time the stages of a training step on fixed scenes, next to the measured peaks of the device."""

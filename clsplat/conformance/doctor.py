@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.conformance.check import Deviation
-from clsplat.conformance.checks import KERNELS, SPEED
+from clsplat.conformance.checks import KERNELS, SPEED, TILED
 from clsplat.conformance.host import describe_host
 from clsplat.conformance.quick import forget, remember
 from clsplat.conformance.supervision import CheckResult, run_checks
@@ -20,7 +20,7 @@ from clsplat.core.errors import pluralize
 from clsplat.core.files import check_result_path, raising_output_error, write_text
 from clsplat.core.page import duration_text, render
 from clsplat.opencl.device import Device
-from clsplat.opencl.discovery import DeviceInfo, choose_device, resolve_schedule
+from clsplat.opencl.discovery import SCHEDULES, DeviceInfo, choose_device, resolve_schedule
 from clsplat.opencl.kernel_caches import kernel_caches
 
 BITONIC = {"fill_tiles", "sort_tiles", "merge_runs"}  # kernels that `rasterizer.sort: radix` does not use
@@ -201,7 +201,6 @@ def _to_plain(result: CheckResult) -> dict[str, Any]:
 
 
 LOG = logging.getLogger("clsplat")
-SCHEDULES: tuple[Literal["simt", "wide"], ...] = ("simt", "wide")
 
 
 def examine(device: str | Device | None = None) -> DeviceReport:
@@ -214,7 +213,8 @@ def examine(device: str | Device | None = None) -> DeviceReport:
         if not _is_due(schedule, report):
             continue
         results = report.schedules[schedule] = []
-        for result in run_checks(info, schedule, KERNELS):
+        checks = TILED if schedule == "simt16" and not report.failures["simt"] else KERNELS
+        for result in run_checks(info, schedule, checks):
             results.append(result)
             LOG.info("%s", progress_line(schedule, result))
         if all(result.passes and not result.damaged_cache for result in results):
@@ -233,6 +233,8 @@ def _is_due(schedule: str, report: DeviceReport) -> bool:
 
     Other devices do not benefit from `wide`, and some compilers need many minutes for its vectors.
     """
+    if schedule == "simt16":
+        return report.info.group >= 256  # an item of the group for each pixel of a tile
     if schedule == "simt" or report.default == "wide":
         return True
     return report.info.kind == "CPU" and bool(report.failures["simt"])
@@ -244,7 +246,7 @@ def progress_line(schedule: str, result: CheckResult) -> str:
     count = len(result.deviations)
     success = f"{pluralize(count, 'comparison')} passed" if count else "measured"
     outcome = f"WRONG: {failures[0]}" if failures else success
-    return f"  {f'{schedule:<5}{result.name}':<54}{result.seconds:5.1f} s  {outcome}"
+    return f"  {f'{schedule:<7}{result.name}':<56}{result.seconds:5.1f} s  {outcome}"
 
 
 # The report as an HTML page that opens offline, to attach to a bug report.

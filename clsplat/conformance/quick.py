@@ -7,7 +7,6 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Literal
 
 from clsplat.conformance.host import code_variables
 from clsplat.conformance.supervision import run_checks
@@ -16,13 +15,12 @@ from clsplat.core.files import write_text
 from clsplat.core.machine import cache_folder
 from clsplat.core.resources import __version__, resource_dir
 from clsplat.opencl.device import BUILD_OPTIONS, Device, open_device
-from clsplat.opencl.discovery import DeviceInfo, Schedule, tuning_macros
+from clsplat.opencl.discovery import DeviceInfo, FixedSchedule, Schedule, tuning_macros
 from clsplat.opencl.kernel_caches import kernel_cache_advice
 from clsplat.render.tiles import Sort, resolve_sort
 
 LOG = logging.getLogger("clsplat")
 TIMEOUT_S = 300  # longest time without output from a check
-FixedSchedule = Literal["wide", "simt"]
 SORTS = ("radix", "bitonic")  # each has a record
 
 

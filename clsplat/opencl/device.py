@@ -4,7 +4,6 @@ Only this package imports pyopencl.
 """
 
 import itertools
-import logging
 import math
 import re
 import sqlite3
@@ -33,7 +32,6 @@ runtimes.prepare()
 import pyopencl as cl  # noqa: E402
 
 warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes warn at every build
-LOG = logging.getLogger("clsplat")
 
 
 @contextmanager
@@ -192,8 +190,7 @@ class Device:
 
     `name` is a part of a runtime's or device's name, as `clsplat devices` prints them.  By default, the device is
     the one named in CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU.
-    Raises DeviceError if there is none, MemoryLimitError or DeviceError if the runtime cannot open it, and KernelError
-    if the blending kernels do not fit.
+    Raises DeviceError if there is none, MemoryLimitError or DeviceError if the runtime cannot open it.
     """
 
     def __init__(self, name: str | DeviceInfo | None = None, schedule: Schedule = "auto") -> None:
@@ -214,8 +211,6 @@ class Device:
         self.lock = threading.Lock()  # protects what threads share: programs, and the arguments of their kernels
         self.recording = Recording()
         self._programs: dict[tuple[Any, ...], Program] = {}
-        if self.schedule == "simt":
-            self._fit_groups()
 
     def __enter__(self) -> "Device":
         return self
@@ -225,17 +220,6 @@ class Device:
 
     def __repr__(self) -> str:
         return f"Device({self.label!r})"
-
-    def _fit_groups(self) -> None:
-        """Use tiles of 8 x 8 px if the compiler does not allow blending groups of 16 x 16 items."""
-        try:
-            self.program("blend_simt.cl")
-        except KernelError as error:
-            if self.tuning["TILE"] == 8:
-                raise
-            LOG.info("using tiles of 8 x 8 px instead of 16 x 16: %s", error)
-            self.tuning["TILE"] = 8
-            self.program("blend_simt.cl")
 
     @property
     def label(self) -> str:

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from clsplat.core.errors import ConfigError, DeviceError, one_line, quote
 from clsplat.opencl import runtimes
@@ -20,7 +20,9 @@ import pyopencl as cl  # noqa: E402
 DEVICE_VARIABLE = "CLSPLAT_DEVICE"
 LOCAL_MEMORY = 32 << 10  # bytes that kernels may use per work-group; OpenCL 1.2, full profile
 LOG = logging.getLogger("clsplat")
-Schedule = Literal["auto", "wide", "simt"]
+FixedSchedule = Literal["simt", "simt16", "wide"]
+Schedule = Literal["auto", FixedSchedule]
+SCHEDULES: tuple[FixedSchedule, ...] = get_args(FixedSchedule)
 
 
 @dataclass(frozen=True)
@@ -167,16 +169,16 @@ def _find_by_name(device_name: str, devices: list[DeviceInfo]) -> DeviceInfo:
     return info
 
 
-def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> Literal["wide", "simt"]:
+def resolve_schedule(info: DeviceInfo, schedule: Schedule) -> FixedSchedule:
     """Return the schedule for a device.  `auto` is `wide` for CPUs with vectors of 8 floats or more, else `simt`."""
     if schedule == "auto":
         return "wide" if info.kind == "CPU" and info.float_width >= 8 else "simt"
-    if schedule not in ("wide", "simt"):
-        raise ConfigError(f"unknown schedule '{schedule}'; expected auto, wide, or simt")
+    if schedule not in SCHEDULES:
+        raise ConfigError(f"unknown schedule '{schedule}'; expected auto, simt, simt16, or wide")
     return schedule
 
 
-def tuning_macros(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[str, int | str]:
+def tuning_macros(info: DeviceInfo, schedule: FixedSchedule) -> dict[str, int | str]:
     """Return the macros with which kernels are built for a device; cl_kernels/common.h explains them."""
     if schedule == "wide":
         return {
@@ -193,5 +195,5 @@ def tuning_macros(info: DeviceInfo, schedule: Literal["wide", "simt"]) -> dict[s
         "GROUP": 64,
         "TEAM": 64,
         "DIGIT_BITS": 4,
-        "TILE": 16 if info.group >= 256 else 8,
+        "TILE": 16 if schedule == "simt16" else 8,
     }

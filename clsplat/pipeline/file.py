@@ -110,7 +110,8 @@ class RasterizerSettings(Settings):
     output_keys: ClassVar[frozenset[str]] = frozenset({"harmonics"})
 
     schedule: Schedule = "auto"
-    """Blending schedule: wide for CPUs, simt for GPUs."""
+    """Blending schedule: `wide` for CPUs; for GPUs, `simt` with tiles of 8×8 px, or `simt16` with tiles of 16×16 px.
+    A resumed run on the same device keeps what `auto` chose."""
     sort: Sort = "auto"
     """Algorithm that sorts splats by tile and depth; auto: bitonic on GPUs unless lists are very long, else radix."""
     pair_budget: Annotated[int, Field(gt=0)] | None = None

@@ -324,7 +324,8 @@ class Rasterizer:
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """Return the blending kernels for the content of a frame, such as depth."""
-        return self.device.program(f"blend_{self.device.schedule}.cl", **defines, **DEFINES.get(content, {}))
+        schedule = "simt" if int(self.device.tuning["LANES"]) == 1 else "wide"
+        return self.device.program(f"blend_{schedule}.cl", **defines, **DEFINES.get(content, {}))
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
         bands = min(self._bands.get(camera.tiles_y, 1), camera.tiles_y)

@@ -14,8 +14,9 @@ from clsplat.core.files import UNDISTORTED
 from clsplat.core.machine import Owner
 from clsplat.core.progress import Listener, listening, log_level
 from clsplat.opencl.device import Device
+from clsplat.opencl.discovery import SCHEDULES
 from clsplat.photos.photographs import Photographs
-from clsplat.pipeline.file import SceneSettings
+from clsplat.pipeline.file import RasterizerSettings, SceneSettings
 from clsplat.pipeline.input_files import content_hashes
 from clsplat.pipeline.loading import Pipeline, apply_adaptation, prepared_folder
 from clsplat.pipeline.stretching import map_trainings
@@ -35,7 +36,7 @@ from clsplat.stages.optimize import Optimize
 from clsplat.stages.train_field import TrainField
 from clsplat.training.modules.sky_choice import choose_sky
 from clsplat.training.run import Run
-from clsplat.training.status import StatusFile
+from clsplat.training.status import StatusFile, read_status
 
 # The scene of a run, with all photos decoded.
 
@@ -158,11 +159,25 @@ def check_start(
     settings = pipeline.settings
     for stage in pipeline.stages:
         stage.check()
-    opened_device = open_verified(device, settings.rasterizer.schedule, settings.rasterizer.sort)
+    opened_device = _open_device(
+        settings.rasterizer, device, read_status(out).get("device") if start == "resume" else ""
+    )
     planned_steps = check_preparation(pipeline, out)
     if planned_steps and start != "restart" and read_summary(out) not in (None, make_summary(planned_steps)):
         raise ConfigError(f"{out}: was started with other photos or other settings of `prepare`; use another folder")
     return opened_device, planned_steps
+
+
+def _open_device(rasterizer: RasterizerSettings, device: str | Device | None, earlier: object) -> Device:
+    """Open a verified device; `auto` keeps the schedule of the earlier run if that used the same device.
+
+    earlier: label of the device of the earlier run.
+    """
+    result = open_verified(device, rasterizer.schedule, rasterizer.sort)
+    for schedule in SCHEDULES if rasterizer.schedule == "auto" and not isinstance(device, Device) else ():
+        if earlier == f"{result.info.label}, {schedule} schedule" != result.label:
+            return open_verified(device, schedule, rasterizer.sort)
+    return result
 
 
 def list_photo_names(pipeline: Pipeline, steps: Sequence[PlannedStep], out: Path) -> list[str]:

@@ -136,7 +136,7 @@ class StatusFile:
         self._require_lock = require_lock
         now = time.time()
         old_status = read_status(out)
-        checkpoint = old_status.get("checkpoint")
+        checkpoint, device = old_status.get("checkpoint"), old_status.get("device")
         self.was_done = old_status.get("state") == "done"  # whether an earlier run in the folder was done
         self.saved_at = time.monotonic()  # s, time of the newest checkpoint, or of the start
         self.has_run = False  # whether a stage has run
@@ -149,7 +149,7 @@ class StatusFile:
             changed=now,
             time=now,
             checkpoint=checkpoint if isinstance(checkpoint, str) else None,
-            **values,
+            **{"device": device if isinstance(device, str) else None, **values},
         )
         self._state_lock, self._write_lock = threading.Lock(), threading.Lock()
         self._ended = threading.Event()

@@ -182,10 +182,10 @@ def test_file_of_the_working_folder_is_not_imported(monkeypatch, info, tmp_path,
 @pytest.mark.parametrize(
     ("kind", "width", "value", "schedules"),
     [
-        ("CPU", 16, "1e-6", ["simt", "wide"]),
-        ("CPU", 1, "1e-6", ["simt"]),
-        ("CPU", 1, "0.3", ["simt", "wide"]),
-        ("GPU", 1, "0.3", ["simt"]),
+        ("CPU", 16, "1e-6", ["simt", "simt16", "wide"]),
+        ("CPU", 1, "1e-6", ["simt", "simt16"]),
+        ("CPU", 1, "0.3", ["simt", "simt16", "wide"]),
+        ("GPU", 1, "0.3", ["simt", "simt16"]),
     ],
 )
 def test_wide_schedule_is_tried_where_it_could_run(monkeypatch, info, empty_cache, kind, width, value, schedules):
@@ -317,10 +317,11 @@ def test_verdict_is_printed_although_the_page_fails(monkeypatch, capsys, info, e
 def test_correct_device_is_not_refused(info, empty_cache, monkeypatch):
     """Runs some checks in child processes; tests/conformance/test_checks_kernels.py runs all of them."""
     monkeypatch.setattr(doctor, "KERNELS", [BY_NAME["blur"], KERNELS[-1]])
+    monkeypatch.setattr(doctor, "TILED", [KERNELS[-1]])
     monkeypatch.setattr(doctor, "SPEED", SPEED[:1])
     report = examine(Device(info))
     assert report.verdict.text == "use it", report.text()
-    assert set(report.schedules) == {"wide", "simt"} if report.default == "wide" else {"simt"}
+    assert list(report.schedules) == ["simt", "simt16", *(["wide"] if report.default == "wide" else [])]
     assert report.note("training")["steps"] == 60
 
 

@@ -235,18 +235,12 @@ def image_of(device: Device, rng: np.random.Generator) -> np.ndarray:
     return frame.image.get()[:, :37, :50]
 
 
-def test_capped_blending_gets_smaller_tiles_and_the_same_image(info, rng, monkeypatch, caplog):
-    image = image_of(Device(info, "simt"), np.random.default_rng(1))
+def test_capped_groups_need_the_small_tiles(info, rng, monkeypatch):
+    image = image_of(Device(info, "simt16"), np.random.default_rng(1))
     capped(monkeypatch, 255, "blend_forward")
-    with caplog.at_level(logging.INFO, "clsplat"):
-        device = Device(info, "simt")
-    assert device.tuning["TILE"] == 8
-    assert len(caplog.records) == 1
-    assert (
-        "using tiles of 8 x 8 px instead of 16 x 16: blend_simt.cl:blend_forward needs work-groups of 256 items"
-        in caplog.text
-    )
-    np.testing.assert_array_equal(image_of(device, np.random.default_rng(1)), image)
+    with pytest.raises(KernelError, match=r"blend_forward needs work-groups of 256 items, but .*rasterizer\.schedule"):
+        image_of(Device(info, "simt16"), np.random.default_rng(1))
+    np.testing.assert_array_equal(image_of(Device(info, "simt"), np.random.default_rng(1)), image)
 
 
 def test_kernel_whose_group_is_too_large_is_refused(info, monkeypatch):
@@ -258,10 +252,10 @@ def test_kernel_whose_group_is_too_large_is_refused(info, monkeypatch):
 def test_limit_understated_by_rusticl_refuses_no_kernel(info, monkeypatch):
     capped(monkeypatch, 32)
     monkeypatch.setattr(program, "group_multiple", lambda *_: 32)
-    assert Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt").tuning["TILE"] == 16
+    Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt").program("blend_simt.cl")
     capped(monkeypatch, 48)
     with pytest.raises(KernelError, match="allows 48"):
-        Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt")
+        Device(replace(info, platform="rusticl, OpenCL 3.0"), "simt").program("blend_simt.cl")
 
 
 def test_wide_needs_no_kernel_with_barriers(info, rng, monkeypatch):

@@ -86,7 +86,7 @@ def test_every_kernel_is_built_in_both_schedules():
 def test_different_builds_are_distinguished():
     variants = [build.variant for build in builds(["simt"], ["blend_simt.cl"])]
     assert variants[0] == ""
-    assert {"TILE 8", "PIXEL_SUMS 11", "PIXEL_SUMS 13", "PIXEL_SUMS 13, TILE 8"} <= set(variants)
+    assert {"TILE 16", "PIXEL_SUMS 11", "PIXEL_SUMS 13", "PIXEL_SUMS 13, TILE 16"} <= set(variants)
     assert [build.variant for build in builds(["simt"], ["check.cl"])] == [""]
 
 

@@ -2,10 +2,13 @@
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import pytest
 
 from clsplat.core.errors import ConfigError
+from clsplat.pipeline.file import RasterizerSettings
+from clsplat.runs import opening
 from clsplat.sweeps.experiment import Job
 from clsplat.training import archive
 from clsplat.training.status import read_status
@@ -100,3 +103,26 @@ def test_longer_training_reports_what_a_longer_plan_changes(few_steps, tiny_scen
     caplog.clear()
     Job.resume(out, steps=14)
     assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("schedule", "earlier", "expected"),
+    [
+        ("auto", "{}, simt16 schedule", ["auto", "simt16"]),
+        ("auto", "{}, wide schedule", ["auto"]),
+        ("auto", "another device, simt16 schedule", ["auto"]),
+        ("auto", None, ["auto"]),
+        ("simt", "{}, simt16 schedule", ["simt"]),
+    ],
+)
+def test_resumed_run_keeps_its_schedule(monkeypatch, info, schedule, earlier, expected):
+    opened = []
+
+    def open_verified(device, schedule, sort):
+        opened.append(schedule)
+        return SimpleNamespace(info=info, label=f"{info.label}, {'wide' if schedule == 'auto' else schedule} schedule")
+
+    monkeypatch.setattr(opening, "open_verified", open_verified)
+    rasterizer = RasterizerSettings(schedule=schedule)
+    opening._open_device(rasterizer, None, earlier.format(info.label) if earlier else None)
+    assert opened == expected

@@ -10,7 +10,7 @@ import pytest
 NAMES = [name.strip() for name in os.environ.get("CLSPLAT_TEST_DEVICES", "").split(";")]
 
 
-TUNINGS = {"wide16": ("wide", 16), "wide8": ("wide", 8), "simt": ("simt", 1)}
+TUNINGS = {"wide16": ("wide", 16), "wide8": ("wide", 8), "simt": ("simt", 1), "simt16": ("simt16", 1)}
 
 
 def joined(*parts: Any) -> Any:

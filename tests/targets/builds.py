@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -11,7 +11,7 @@ from clsplat.core.resources import resource_dir
 from clsplat.core.settings import variants
 from clsplat.density.statistics import Statistic
 from clsplat.opencl.device import BUILD_OPTIONS, flatten, parse_kernels
-from clsplat.opencl.discovery import DeviceInfo, tuning_macros
+from clsplat.opencl.discovery import DeviceInfo, FixedSchedule, tuning_macros
 from clsplat.render.rasterizer import PIXEL_SUMS
 
 Schedule = Literal["simt", "wide"]
@@ -20,7 +20,7 @@ GPU = DeviceInfo(
     name="", platform="", kind="GPU", driver="", units=16, memory=2**33, allocation=2**31, local_memory=2**15,
     group=256, float_width=1, index=(0, 0),
 )  # fmt: skip
-DEVICES = {"simt": [GPU, replace(GPU, group=64)], "wide": [GPU]}  # wide where somebody asks a GPU for it
+WITH_TILES: dict[Schedule, tuple[FixedSchedule, ...]] = {"simt": ("simt", "simt16"), "wide": ("wide",)}
 SCHEDULES: tuple[Schedule, ...] = ("simt", "wide")
 SUMS = sorted({kind.pixel_sums for kind in variants(Statistic).values()} - {PIXEL_SUMS})
 BOX = {"PIXEL_BOX": 1}
@@ -48,7 +48,7 @@ class Build:
     path: Path
     schedule: Schedule
     defines: tuple[tuple[str, int | str], ...]  # by name
-    variant: str = ""  # what differs from the first build of the file and schedule: 'TILE 8'
+    variant: str = ""  # what differs from the first build of the file and schedule: 'TILE 16'
 
     @property
     def options(self) -> list[str]:
@@ -80,9 +80,9 @@ def _of_file(path: Path, schedule: Schedule) -> Iterator[Build]:
     words = set(re.findall(r"\w+", flatten(path, {KERNELS / "common.h"})))
     first: dict[str, int | str] = {}
     seen: set[tuple[tuple[str, int | str], ...]] = set()
-    for info in DEVICES[schedule]:
+    for with_tile in WITH_TILES[schedule]:
         for passed in [{}, *PASSED.get(path.name, [])]:
-            defines = {**tuning_macros(info, schedule), **passed}
+            defines = {**tuning_macros(GPU, with_tile), **passed}
             read = {name: value for name, value in sorted(defines.items()) if name in words}
             first = first or read
             if tuple(read.items()) not in seen:
