@@ -459,6 +459,7 @@ def convert(
     drop_below: float = 0.0,
     filter_floaters: bool = False,
     level: bool = False,
+    splats: int | None = None,
     sky: Literal["splats", "none"] | None = None,
     time: float | None = None,
     frames: int | None = None,
@@ -474,6 +475,7 @@ def convert(
     drop_below: drop Gaussians with a lower opacity
     filter_floaters: drop Gaussians that are large and faint, isolated, or far outside the scene; needs no photos
     level: turn the model so that its ground is at y = 0 and up is -y; the ground must be within 45 degrees of level
+    splats: merge neighbors until this number of Gaussians remains, not counting the sky
     sky: "splats" writes a learned sky as distant Gaussians, "none" removes it; default: leave it as it is
     time: write a moving model as a static model at this time, in [0, 1]
     frames: write this number of static files at evenly spaced times: PLY files in the folder `out`, or files named
@@ -498,6 +500,7 @@ def convert(
         conversion.check_time(time),
         world,
         sky,
+        splats,
     )
     if frames is not None:
         return conversion.convert_frames(files, Path(out), frames, changes, quality)

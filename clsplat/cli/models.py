@@ -120,6 +120,26 @@ def view(
     terminal.print_message(f"{page}: {prefix}{page.stat().st_size / 1e6:.1f} MB; open it in a browser")
 
 
+CropOption = Annotated[
+    str | None,
+    typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep this box, in world coordinates after --transform."),
+]
+TransformOption = Annotated[
+    str | None,
+    typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; also rotates SH."),
+]
+MergeOption = Annotated[
+    int | None, typer.Option(metavar="N", min=1, help="Merge neighbors until N Gaussians remain, without the sky.")
+]
+SkyOption = Annotated[
+    Literal["splats", "none"] | None, typer.Option(help="Write a learned sky as distant Gaussians, or remove it.")
+]
+FramesOption = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Dynamic model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
+]
+
+
 @command(
     "convert",
     "clsplat convert point_cloud.ply scene.spz",
@@ -135,14 +155,8 @@ def convert(
     quality: Annotated[
         Literal["small", "balanced", "high"], typer.Option(help="Precision of the values in SPZ and SOG files.")
     ] = "balanced",
-    crop: Annotated[
-        str | None,
-        typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep this box, in world coordinates after --transform."),
-    ] = None,
-    transform: Annotated[
-        str | None,
-        typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; also rotates SH."),
-    ] = None,
+    crop: CropOption = None,
+    transform: TransformOption = None,
     drop_below: Annotated[
         float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians with a lower opacity.")
     ] = 0.0,
@@ -152,16 +166,12 @@ def convert(
     level: Annotated[
         bool, typer.Option("--level", help="Turn the model upright: its ground at y = 0, up is -y.")
     ] = False,
-    sky: Annotated[
-        Literal["splats", "none"] | None, typer.Option(help="Write a learned sky as distant Gaussians, or remove it.")
-    ] = None,
+    splats: MergeOption = None,
+    sky: SkyOption = None,
     time: Annotated[
         float | None, typer.Option(metavar="T", help="Dynamic model: write it at this time, 0 to 1.")
     ] = None,
-    frames: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Dynamic model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
-    ] = None,
+    frames: FramesOption = None,
     world: Annotated[bool, typer.Option("--world", help="Write world coordinates, without an origin.")] = False,
 ) -> None:
     """Convert models to another format: PLY, SPZ, SOG, glTF, HTML, CSV, and others."""
@@ -175,6 +185,7 @@ def convert(
         drop_below=drop_below,
         filter_floaters=filter_floaters,
         level=level,
+        splats=splats,
         sky=sky,
         time=time,
         frames=frames,

@@ -33,6 +33,7 @@ from clsplat.formats.splats import (
     with_degree,
 )
 from clsplat.formats.table import format_from_name, model_bytes, writing_format
+from clsplat.gaussians.mixture import merge_neighbors
 from clsplat.gaussians.model import Model, exported_model_path, load, model_path
 from clsplat.gaussians.motion import static_motion, with_motion
 from clsplat.gaussians.sky import sample_texels, sky_path
@@ -98,6 +99,7 @@ class Changes:
     time: float | None = None  # of a moving model: the timestamp to extract
     world: bool = False  # write world coordinates instead of an origin
     sky: SkyForm | None = None  # write a sky as Gaussians, or remove it; None: leave it as it is
+    splats: int | None = None  # number of Gaussians, without the sky, to which neighbors are merged
 
     def apply(self, model: Model) -> Model:
         """Return the converted model.  Raises DataError if no Gaussian remains, ConfigError for extreme transforms."""
@@ -122,10 +124,22 @@ class Changes:
             result = result[is_inside | ~result.is_scene if self.sky == "splats" else is_inside]
         if self.sh_degree is not None and self.sh_degree < result.sh_degree:
             result = replace(result, sh_rest=with_degree(result.tables(), self.sh_degree)["sh_rest"])
+        if self.splats is not None:
+            result = merged(result, self.splats)
         if not len(result):
             fault = f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold"
             raise DataError(fault if len(model) else "the model has no Gaussians, or none with valid values")
         return with_sky_splats(result) if self.sky == "splats" else result
+
+
+def merged(model: Model, count: int) -> Model:
+    """Return a model with at most `count` Gaussians and those of its sky, by merging neighbors.  Raises ConfigError."""
+    if count < 1:
+        raise ConfigError(f"--splats {count}: expected a number of Gaussians of at least 1")
+    if model.motion is not None:
+        raise ConfigError("--splats needs a static model; add --time T")
+    is_scene = model.is_scene
+    return merge_models([merge_neighbors(model[is_scene], count), model[~is_scene]], ["the scene", "the sky"])
 
 
 SOLID = 0.5  # smallest opacity of the Gaussians that may be ground

@@ -14,11 +14,11 @@ from pydantic import Field
 from clsplat.core.schedule import NonNegative, Positive, explain_schedule
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import select_largest
-from clsplat.density.mixture import masses, merge
 from clsplat.density.statistics import SEEN, Statistic, StatisticName
 from clsplat.density.thresholds import PixelQuantile, Quantile, Threshold, UnitInterval
 from clsplat.formats.splats import SH_C0, inverse_opacities
 from clsplat.gaussians.gaussians import INTERVAL2, Gaussians
+from clsplat.gaussians.mixture import masses, merge
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array
 from clsplat.photos.photographs import unmasked_gradient

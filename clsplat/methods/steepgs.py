@@ -14,9 +14,9 @@ from pydantic import Field
 from clsplat.core.schedule import NonNegative, Positive, Schedule
 from clsplat.density.edit import Edit, Rule
 from clsplat.density.importance import select_largest
-from clsplat.density.mixture import covariance_matrices
 from clsplat.density.statistics import NEEDS_CONIC, Statistic
 from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.mixture import covariance_matrices
 from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array
 

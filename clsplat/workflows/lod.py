@@ -3,21 +3,18 @@
 import logging
 import math
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from scipy.spatial import cKDTree
 
 from clsplat.core.errors import ConfigError, DataError, pluralize
 from clsplat.core.files import new_folder, require_free
 from clsplat.core.reading import sha256
 from clsplat.core.text_table import text_table
-from clsplat.density.mixture import Floats, Mixtures, Rows, masses, merge, surface, to_log_scales
-from clsplat.formats.splats import normalize_quats, not_finite, require_in_range, require_static
+from clsplat.formats.splats import require_in_range, require_static
 from clsplat.formats.streamed_sog import LOD_META, write_lod
 from clsplat.formats.table import model_bytes, model_file
+from clsplat.gaussians.mixture import merge_neighbors
 from clsplat.gaussians.model import Model, load
 from clsplat.gaussians.sky import sky_path, write_sky_file
 from clsplat.runs.model_file import ModelFile, find_run, photo_folder
@@ -101,12 +98,6 @@ class LevelTrainer:
         return DetailLevel(trained_model, merged_level.psnr, self.measure(trained_model).psnr)
 
 
-NEIGHBORS = 8  # candidates for merging with a Gaussian
-BLOCK = 1 << 16  # pairs per batch of costs
-LOG_SCALES, LOGIT = (-17.0, 60.0), 80.0  # limits that keep derived values within float64
-Tables = dict[str, Floats]
-
-
 def decimate(model: Model, keep: float = 0.5) -> Model:
     """Reduce a model to a fraction of its Gaussians, at least one, by merging neighbors.
 
@@ -115,90 +106,7 @@ def decimate(model: Model, keep: float = 0.5) -> Model:
     """
     if not 0 < keep <= 1:
         raise ConfigError(f"--keep {keep:g}: expected a fraction of the Gaussians above 0, up to 1")
-    baked_model = model.baked()
-    if invalid_count := int(not_finite(baked_model.tables()).sum()):
-        raise DataError(f"{invalid_count} Gaussians have values that are not finite; drop them with `clsplat convert`")
-    target = min(len(baked_model), max(1, int(keep * len(baked_model) + 0.5)))
-    if target == len(baked_model):
-        return baked_model
-    tables = _clipped_tables(baked_model)
-    while (count := len(tables["means"])) > target:
-        first, second = match_pairs(tables)
-        tables = _merge_pairs(tables, first[: count - target], second[: count - target])
-    arrays: dict[str, Any] = {name: table.astype(np.float32) for name, table in tables.items()}
-    return replace(baked_model, **arrays)
-
-
-def match_pairs(tables: Tables) -> tuple[Rows, Rows]:
-    """Return disjoint pairs of rows, the cheapest first.  There is at least one pair if there are at least two rows."""
-    first, second = _find_neighbors(tables["means"])
-    cost = pair_cost(tables, first, second)
-    order = np.lexsort((second, first, np.where(np.isfinite(cost), cost, np.inf)))
-    is_free = bytearray(b"\1") * len(tables["means"])
-    selected_rows = []
-    for start in range(0, len(order), BLOCK):
-        batch = order[start : start + BLOCK]
-        for pair, i, j in zip(batch.tolist(), first[batch].tolist(), second[batch].tolist(), strict=True):
-            if is_free[i] and is_free[j]:
-                is_free[i] = is_free[j] = 0
-                selected_rows.append(pair)
-    return first[selected_rows], second[selected_rows]
-
-
-def pair_cost(tables: Tables, first: Rows, second: Rows) -> Floats:
-    """Return the cost of merging each pair, [pairs].  Swapping `first` and `second` changes it only by rounding."""
-    mass, log_volume = masses(tables, surface), tables["log_scales"].sum(axis=1)  # of all rows, computed once
-    blocks = [slice(start, start + BLOCK) for start in range(0, len(first), BLOCK)]
-    return np.concatenate([_block_cost(tables, mass, log_volume, first[block], second[block]) for block in blocks])
-
-
-def _block_cost(tables: Tables, mass: Floats, log_volume: Floats, first: Rows, second: Rows) -> Floats:
-    mixtures = Mixtures.from_pairs(tables, mass, first, second)
-    fraction = mixtures.fraction[:, 0]
-    variances = np.linalg.eigvalsh(mixtures.covariance).astype(np.float64)
-    cost: Floats = (
-        to_log_scales(variances).sum(axis=1) - (1 - fraction) * log_volume[first] - fraction * log_volume[second]
-    )
-    for name in ("sh_base", "sh_rest"):
-        cost += np.square(tables[name][first] - tables[name][second]).sum(axis=1)
-    return cost
-
-
-def _find_neighbors(means: Floats) -> tuple[Rows, Rows]:
-    """Return unique pairs of rows that are nearest neighbors, lower row first, in ascending order.
-
-    Rows at the same position are paired as a chain, and only the first row of a chain has neighbors elsewhere.
-    """
-    positions, first_row, position_index = np.unique(means, axis=0, return_index=True, return_inverse=True)
-    count = len(positions)
-    nearest_indices = cKDTree(positions).query(positions, k=min(NEIGHBORS + 1, count))[1].reshape(count, -1)
-    row, neighbor = first_row[np.repeat(np.arange(count), nearest_indices.shape[1])], first_row[nearest_indices.ravel()]
-    order = np.argsort(position_index.ravel(), kind="stable")
-    is_same = np.diff(position_index.ravel()[order]) == 0
-    row = np.concatenate([row, order[:-1][is_same]])
-    neighbor = np.concatenate([neighbor, order[1:][is_same]])
-    count, is_pair = len(means), row != neighbor
-    pairs = np.unique(np.minimum(row, neighbor)[is_pair].astype(np.int64) * count + np.maximum(row, neighbor)[is_pair])
-    return pairs // count, pairs % count
-
-
-def _clipped_tables(model: Model) -> Tables:
-    """Return float64 tables with unit quaternions, and values clipped so that no derived value overflows."""
-    tables = {name: table.astype(np.float64) for name, table in model.tables().items()}
-    tables["quats"] = normalize_quats(tables["quats"])
-    tables["log_scales"] = np.clip(tables["log_scales"], *LOG_SCALES)
-    tables["logit_opacity"] = np.clip(tables["logit_opacity"], -LOGIT, LOGIT)
-    return tables
-
-
-def _merge_pairs(tables: Tables, first: Rows, second: Rows) -> Tables:
-    """Return the tables with each pair merged into its row of `first`, and the rows `second` removed."""
-    is_remaining = np.ones(len(tables["means"]), bool)
-    is_remaining[second] = False
-    mixtures = merge(tables, first, second, surface)
-    for name, values in mixtures.items():
-        tables[name][first] = values
-    return {name: table[is_remaining] for name, table in tables.items()}
+    return merge_neighbors(model, max(1, int(keep * len(model) + 0.5)))
 
 
 LOG = logging.getLogger("clsplat")

@@ -17,11 +17,11 @@ from clsplat.cli import app
 from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.files import check_not_run_file
 from clsplat.core.harmonics import basis
-from clsplat.density.mixture import masses
 from clsplat.formats.ply import write_ply
 from clsplat.formats.splats import flip_axes, inverse_opacities, opacities
 from clsplat.formats.table import CODECS, detect, model_bytes, read, write
 from clsplat.gaussians.conversion import parse_transform
+from clsplat.gaussians.mixture import masses
 from clsplat.gaussians.model import Rendering, load
 from clsplat.gaussians.validate import examine, format_report, verdict
 from clsplat.viewer.packing import pack

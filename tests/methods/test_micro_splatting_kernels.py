@@ -7,10 +7,10 @@ from clsplat.conformance.scenes import random_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit
 from clsplat.density.importance import select_largest
-from clsplat.density.mixture import covariance_matrices, masses, merge
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import PixelQuantile, Quantile, SceneScale
 from clsplat.gaussians.gaussians import INTERVAL2
+from clsplat.gaussians.mixture import covariance_matrices, masses, merge
 from clsplat.methods.adc import Clone, PruneFaint
 from clsplat.methods.micro_splatting import MergeNeighbors, PruneUnimportant, SplitOversized, SplitTextured
 from clsplat.render.rasterizer import Rasterizer

@@ -10,10 +10,10 @@ from clsplat.conformance.check import GRADIENT, relative_error
 from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
-from clsplat.density.mixture import covariance_matrices
 from clsplat.density.statistics import SEEN, SplatStats
 from clsplat.density.thresholds import SceneScale
 from clsplat.gaussians.gaussians import Gaussians
+from clsplat.gaussians.mixture import covariance_matrices
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.methods.adc import Clone, PruneFaint
 from clsplat.methods.steepgs import UPPER, SplitSteepest, divide_logits, smallest_eigenvectors

@@ -1,16 +1,22 @@
 """Decimation by merging pairs, against a simple float64 reference, and preserved properties."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import clsplat
 from clsplat.core.errors import ConfigError, DataError
-from clsplat.density import mixture
-from clsplat.density.mixture import covariance_matrices, masses, merge, surface, volume
 from clsplat.formats.splats import PARAMETERS
+from clsplat.gaussians import mixture
+from clsplat.gaussians.conversion import merged, with_sky_splats
+from clsplat.gaussians.mixture import covariance_matrices, masses, match_pairs, merge, pair_cost, surface, volume
 from clsplat.gaussians.model import Model, Rendering
-from clsplat.workflows import lod
-from clsplat.workflows.lod import decimate, match_pairs, pair_cost
-from tests.support.models import splats
+from clsplat.gaussians.sky import Sky
+from clsplat.scene.camera import Camera
+from clsplat.scene.view import View
+from clsplat.workflows.lod import decimate
+from tests.support.models import interop, splats
 
 
 def model(rng: np.random.Generator, count: int, degree: int = 2, mode: str = "default") -> Model:
@@ -138,10 +144,9 @@ def test_work_grows_with_rows_and_pairs_not_with_their_product(rng, monkeypatch)
     monkeypatch.setattr(
         mixture, "masses", lambda tables, size: rows.append(len(tables["means"])) or masses(tables, size)
     )
-    monkeypatch.setattr(lod, "masses", mixture.masses, raising=False)
     source = float64_tables(model(rng, 300))
     whole = match_pairs(source)
-    monkeypatch.setattr(lod, "BLOCK", 50)
+    monkeypatch.setattr(mixture, "BLOCK", 50)
     for one, two in zip(match_pairs(source), whole, strict=True):
         np.testing.assert_array_equal(one, two)
     assert rows == [300, 300]
@@ -203,3 +208,56 @@ def test_unmergeable_model_is_refused(rng):
     source.means[2, 1] = np.nan
     with pytest.raises(DataError, match="1 Gaussians have values that are not finite"):
         decimate(source)
+
+
+def test_convert_merges_to_a_number_of_gaussians(rng, tmp_path):
+    """The mass, mean, and covariance of the whole model stay, whatever the number; the same bytes twice."""
+    source = model(rng, 300, degree=1)
+    source.save(tmp_path / "a.ply")
+    sums = []
+    for name, count in (("b.ply", 1000), ("c.ply", 150), ("d.ply", 7), ("e.ply", 150)):
+        assert clsplat.convert(tmp_path / "a.ply", tmp_path / name, splats=count)["gaussians"] == min(count, 300)
+        tables = float64_tables(clsplat.load(tmp_path / name))
+        parts = [moments(tables, row) for row in range(min(count, 300))]
+        mass = sum(part[0] for part in parts)
+        mean = sum(part[0] * part[1] for part in parts) / mass
+        spread = sum(part[0] * (part[2] + np.outer(part[1] - mean, part[1] - mean)) for part in parts) / mass
+        sums.append((mass, mean, spread))
+        for actual, expected in zip(sums[-1], sums[0], strict=True):
+            np.testing.assert_allclose(actual, expected, rtol=1e-4, atol=1e-5)
+    assert (tmp_path / "c.ply").read_bytes() == (tmp_path / "e.ply").read_bytes()
+
+
+def test_half_of_the_gaussians_look_almost_the_same():
+    """31.9 dB from four sides; the larger half of the Gaussians reaches 29.5 dB."""
+    source = clsplat.load(interop("playbot31k.ply"))
+    center = np.median(source.means, axis=0).astype(np.float64)
+    reach = 3 * np.quantile(np.linalg.norm(source.means - center, axis=1), 0.95)
+    offsets = [(np.cos(angle), -0.3, np.sin(angle)) for angle in np.arange(4) * np.pi / 2]
+    camera = Camera(160, 160, 200, 200, 80, 80)
+    views = [View.looking_at(center + reach * np.array(offset), center, (0, -1, 0), camera) for offset in offsets]
+    expected = [clsplat.Renderer(source).render(view).image for view in views]
+
+    def psnr(reduced: Model) -> float:
+        renderer = clsplat.Renderer(reduced)
+        images = [np.clip(renderer.render(view).image, 0, 1) for view in views]
+        return float(-10 * np.log10(np.mean(np.square(np.subtract(images, np.clip(expected, 0, 1))))))
+
+    result = merged(source, len(source) // 2)
+    size = source.opacities * np.sort(source.scales, axis=1)[:, 1:].prod(axis=1)
+    assert len(result) == len(source) // 2
+    assert psnr(result) > 31
+    assert psnr(result) > psnr(source[np.argsort(-size)[: len(result)]]) + 2
+
+
+def test_sky_is_not_merged_and_motion_is_rejected(rng):
+    source = replace(model(rng, 300), sky=Sky(rng.random((64, 3)).astype(np.float32)))
+    whole = with_sky_splats(source, count=50)
+    result = merged(whole, 150)
+    np.testing.assert_array_equal(result.means[150:], whole.means[300:])
+    assert (len(result), len(result.scene_means)) == (200, 150)
+    with pytest.raises(ConfigError, match="--splats 0: expected a number of Gaussians of at least 1"):
+        merged(whole, 0)
+    motion = np.zeros((300, 5), np.float32)
+    with pytest.raises(ConfigError, match="--splats needs a static model; add --time T"):
+        merged(replace(source, motion=motion), 20)
