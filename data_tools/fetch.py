@@ -154,7 +154,7 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
     temporary = out.with_name(f".{out.name}.unpacking")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
-        with _members(archive) as members:
+        with _open_members(archive) as members:
             total = sum(size for _, size, _ in members)
             if total > MAX_UNPACKED_SIZE:
                 raise DataError(
@@ -162,7 +162,7 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
                 )
             report(f"unpacking {len(members)} files, {total / 1e6:,.0f} MB")
             for name, size, open_member in members:
-                target = temporary / _checked_path(archive, name)
+                target = temporary / _check_path(archive, name)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with open_member() as stream, target.open("wb") as file:
                     _copy(stream, file, size, archive)
@@ -174,7 +174,7 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
 
 
 @contextmanager
-def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], BinaryIO]]]]:
+def _open_members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], BinaryIO]]]]:
     """Yield a list with the name and size of each regular file of an archive, and a function that opens the file.
 
     Links and devices are skipped.
@@ -197,7 +197,7 @@ def _members(archive: Path) -> Iterator[list[tuple[str, int, Callable[[], Binary
         raise DataError(f"{archive}: expected a ZIP or TAR archive; remove it and check the URL")
 
 
-def _checked_path(archive: Path, name: str) -> PurePosixPath:
+def _check_path(archive: Path, name: str) -> PurePosixPath:
     path = PureWindowsPath(name)
     if path.anchor or ".." in path.parts or not path.parts:
         raise DataError(f"{archive}: contains a file '{name}' outside its folder; download it from another source")

@@ -54,7 +54,7 @@ class Spectrum:
         return float(np.interp(1 / divisor, np.linspace(0, 1, LEVELS + 1), self.cumulative))
 
 
-def knots(spectra: Sequence[Spectrum], until: float, max_divisor: float) -> tuple[Floats, Floats]:
+def compute_knots(spectra: Sequence[Spectrum], until: float, max_divisor: float) -> tuple[Floats, Floats]:
     """Return the steps and the downscale factors of a schedule, which fall from at most `max_divisor` to 1 at `until`.
 
     Equal increments of the summed spectral amplitudes take fewer and fewer steps.  If there is no detail to gain, the
@@ -98,7 +98,9 @@ class DetailDivisor(Settings):
 
     def to_schedule(self, photographs: Iterable[NDArray[np.uint8]]) -> Points:
         """Compute the schedule of the downscale factor from the training photographs, each [height, width, 3]."""
-        knot_steps, divisors = knots([Spectrum.from_image(image) for image in photographs], self.until, self.largest)
+        knot_steps, divisors = compute_knots(
+            [Spectrum.from_image(image) for image in photographs], self.until, self.largest
+        )
 
         def interpolate(steps: Floats) -> Floats:
             """Return the downscale factors at steps, interpolated linearly in the number of pixels."""

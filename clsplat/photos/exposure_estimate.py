@@ -56,7 +56,7 @@ class Exposures:
 UNKNOWN = Exposures({}, "neither tracks nor EXIF gives exposures")
 
 
-def exif_exposures(views: Sequence[View]) -> Exposures:
+def exposures_from_exif(views: Sequence[View]) -> Exposures:
     """Compute exposures from EXIF data as log2(t ISO / N²), for image values with a gamma of 2.2.
 
     t is the exposure time in seconds, and N is the f-number.  Real tone curves differ, so the result is only an initial
@@ -146,7 +146,7 @@ def _fit(
     residuals = np.zeros(len(values))
     for round_index in range(ROUNDS):
         if round_index < rounds:
-            exposures += _corrections(photograph, point, logarithms - exposures[photograph], weights, count)
+            exposures += _solve_corrections(photograph, point, logarithms - exposures[photograph], weights, count)
         colors = _means(point, logarithms - exposures[photograph], weights)[point]
         residuals = np.abs(logarithms - exposures[photograph] - colors)
         weights = np.exp(colors) / np.maximum(residuals, EXACT)
@@ -154,7 +154,7 @@ def _fit(
     return np.where(has_too_few, np.nan, exposures), float(residuals.sum())
 
 
-def _corrections(photograph: Integers, point: Integers, target: Floats, weights: Floats, count: int) -> Floats:
+def _solve_corrections(photograph: Integers, point: Integers, target: Floats, weights: Floats, count: int) -> Floats:
     """Return the exposures, [count], that fit `target` best with one color per point, found by conjugate gradients."""
 
     def apply(values: Floats) -> Floats:

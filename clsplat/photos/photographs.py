@@ -197,16 +197,26 @@ def _unpack(workspace: Workspace, camera: DeviceCamera, pixels: Array, factor: f
 
 
 def change_background(
-    workspace: Workspace, camera: DeviceCamera, colors: Array, transparency: Array, background: Array, behind: Array
+    workspace: Workspace,
+    camera: DeviceCamera,
+    colors: Array,
+    transparency: Array,
+    background: Array,
+    new_background: Array,
 ) -> None:
-    """Replace the color `background` with `behind`, both [3], in the planes `colors`, [3, rows, stride].
+    """Replace the color `background` with `new_background`, both [3], in the planes `colors`, [3, rows, stride].
 
     transparency: [1, height, width] uint8, 255 where only the background is visible.
     """
     planes = unpack(workspace, camera, transparency, 1 / 255, "transparency")
     pixels = camera.rows * camera.stride
     workspace.device.program("loss.cl").change_background(
-        items=(pixels, 3), colors=colors, transparency=planes, background=background, behind=behind, pixels=pixels
+        items=(pixels, 3),
+        colors=colors,
+        transparency=planes,
+        background=background,
+        behind=new_background,
+        pixels=pixels,
     )
 
 
@@ -253,7 +263,7 @@ def unmasked_gradient(workspace: Workspace, camera: DeviceCamera, image: Array, 
     return magnitude
 
 
-def texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], quantile: float) -> float:
+def compute_texture_quantile(workspace: Workspace, photographs: Iterable[Photograph], quantile: float) -> float:
     """Compute a quantile of the gradient magnitude over all unmasked pixels, in 1/px, rounded up to 1 / 4000."""
     counts = np.zeros(BINS, np.int64)
     for photograph in photographs:

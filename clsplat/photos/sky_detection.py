@@ -21,7 +21,7 @@ MIN_BRIGHTNESS = 0.6  # mean of the channels
 MIN_BLUE_MINUS_RED = 0.03
 MIN_BLUE = 0.3
 MAX_DEVIATION = 0.04  # standard deviation of the brightness in a square of 3 px
-UPPER = 1 / 3  # fraction of a photograph's height
+UPPER_FRACTION = 1 / 3  # fraction of a photograph's height
 MIN_UNMASKED = 1 / 3  # fraction of the upper third; with fewer unmasked pixels, the sky is a fraction of this area
 MIN_SKYWARD = 0.75  # fraction of the sky pixels above the horizon; if it is smaller, they show a wall or a table
 GROWTH = 2  # number of texels around observed sky that count as sky, since pixels near points are excluded
@@ -44,7 +44,7 @@ class SkyEvidence:
         """The fraction of sky pixels in the unmasked upper third; 0 if too many sky pixels look below the horizon."""
         if not self.mask.any() or (self.directions[self.mask] @ self.up > 0).mean() < MIN_SKYWARD:
             return 0.0
-        rows = slice(max(1, round(len(self.mask) * UPPER)))
+        rows = slice(max(1, round(len(self.mask) * UPPER_FRACTION)))
         return float(self.mask[rows].sum() / max(self.unmasked[rows].sum(), MIN_UNMASKED * self.unmasked[rows].size))
 
     @property
@@ -79,7 +79,7 @@ def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -
         yield SkyEvidence(view, small, mask, small_mask, up)
 
 
-def panorama(photos: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32], Mask] | None:
+def build_sky_map(photos: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.float32], Mask] | None:
     """Return the initial colors of an environment map, [side * side, 3], and a mask of sky texels, [side * side].
 
     A texel is sky if a photograph shows sky in or near it, or if no photograph shows it.  Its color is the mean of its

@@ -85,7 +85,7 @@ class Densify(Scheduled):
     def run(self, run: Run) -> None:
         if run.stats is None:
             return
-        scale = SceneScale(run.scene.extent, run.texture_quantile)
+        scale = SceneScale(run.scene.extent, run.compute_texture_quantile)
         edit = Edit(run.model.gaussians, run.stats, scale, run.step, run.seed, run.survey())
         limit_by_settings = min(self._limits(run, edit), default=math.inf)
         capacity = device_capacity(run, limit_by_settings)

@@ -91,7 +91,7 @@ class Batch:
         self._steps = {cell.name: count_steps(cell.pipeline) for cell in self.cells}
         self._counter, self._last_report = ItemCounter("steps", sum(self._steps.values())), time.monotonic()
 
-    def ready(self) -> None:
+    def before_first_cell(self) -> None:
         """Prepare for the first cell.  This is called once, before that cell starts."""
 
     def on_change(self, started_cell: str | None) -> None:
@@ -109,9 +109,9 @@ class Batch:
         with stopping_on_signals(lambda: ask_to_stop(self._stop, has_started)), terminal.counts_on_terminal():
             pending_cells = self._pending_cells()
             if not pending_cells:
-                self.ready()
+                self.before_first_cell()
                 return
-            with _engine(execution, self.store, device, self._is_stopped) as engine:
+            with _open_engine(execution, self.store, device, self._is_stopped) as engine:
                 options = CellOptions(self.store.now(), execution.retries)
                 dispatcher = Dispatcher(
                     self.store, engine, execution.placement.bits == "same", options, self._stop.is_set
@@ -147,7 +147,7 @@ class Batch:
             if cell.name in self.outcomes:
                 continue
             with self.failures.recording(cell.name):
-                pending_cells.append(pending_cell(cell, scenes, self.store))
+                pending_cells.append(prepare_cell(cell, scenes, self.store))
         return pending_cells
 
     def _dispatch(self, dispatcher: Dispatcher, pending_cells: Sequence[PendingCell]) -> None:
@@ -162,7 +162,7 @@ class Batch:
             self._record_start(cell)
 
         dispatcher.on_start = note_start
-        self.ready()
+        self.before_first_cell()
         dispatcher.run(pending_cells)
 
     def _record_start(self, cell: CellRun) -> None:
@@ -207,7 +207,9 @@ def ask_to_stop(stop: threading.Event, has_started: threading.Event) -> None:
 
 
 @contextmanager
-def _engine(execution: Execution, store: Store, device: str | None, is_stopped: Callable[[], bool]) -> Iterator[Engine]:
+def _open_engine(
+    execution: Execution, store: Store, device: str | None, is_stopped: Callable[[], bool]
+) -> Iterator[Engine]:
     configured_names = None if execution.devices == "auto" else execution.devices
     if execution.engine == "inline":
         device_names = [device] if device else configured_names[:1] if configured_names else [""]
@@ -215,14 +217,14 @@ def _engine(execution: Execution, store: Store, device: str | None, is_stopped: 
     else:
         from clsplat.sweeps import dask  # Dask may not be installed
 
-        engine = dask.engine(execution, store, [device] if device else configured_names)
+        engine = dask.open_engine(execution, store, [device] if device else configured_names)
     try:
         yield engine
     finally:
         engine.close()
 
 
-def pending_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> PendingCell:
+def prepare_cell(cell: matrix.Cell, scenes: Scenes, store: Store) -> PendingCell:
     """Run the `prepare` steps of a cell, and return the cell, ready for a device.
 
     Raises ConfigError, DataError, and the errors of the steps.
@@ -269,7 +271,7 @@ def run_one(
     store, stop, has_started = Store(root), threading.Event(), threading.Event()
     with stopping_on_signals(lambda: ask_to_stop(stop, has_started)):
         options = CellOptions(store.now(), retries, "cell")
-        pending = pending_cell(matrix_cell, Scenes(store.prepared), store)
+        pending = prepare_cell(matrix_cell, Scenes(store.prepared), store)
         (slot,) = find_slots("cell", [device or ""])
         cell = pending.in_class(slot.bits)
         store.note_sweep(f"{experiment.name}-{cell.name}", {cell.name: cell.key}, cell.key)
@@ -316,7 +318,7 @@ class _Sweep(Batch):
 
     status: StatusFile
 
-    def ready(self) -> None:
+    def before_first_cell(self) -> None:
         self.status.enter("running")
         self.on_change(None)
 

@@ -20,7 +20,7 @@ PROCESS_GROUP: dict[str, Any] = (
     if os.name == "nt"
     else {"start_new_session": True}
 )
-POLL = 0.25  # seconds between two checks of a process
+POLL_INTERVAL_S = 0.25  # seconds between two checks of a process
 STOP_TIMEOUT_S = 90.0  # for the last step and its checkpoint, before the process is killed
 Command = Sequence[str]  # arguments; the machine that runs it replaces the placeholders
 PYTHON, FILE, OUT = "{python}", "{pipeline}", "{out}"
@@ -88,7 +88,7 @@ def _wait(process: "subprocess.Popen[bytes]", attempt: CellAttempt, is_stopped: 
     stop_time: float | None = None  # time of the request to stop
     while True:
         try:
-            return process.wait(POLL)
+            return process.wait(POLL_INTERVAL_S)
         except subprocess.TimeoutExpired:
             pass
         attempt.beat()

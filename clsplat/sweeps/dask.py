@@ -39,7 +39,7 @@ try:
 except ImportError:
     raise ConfigError("this engine needs Dask: in a checkout, pip install '.[cluster]'") from None
 
-__all__ = ["LOOPBACK", "SETTINGS", "dask", "distributed", "security"]
+__all__ = ["LOOPBACK", "SETTINGS", "dask", "distributed", "make_security"]
 LOOPBACK = "127.0.0.1"
 SIDES = ("client", "worker", "scheduler")
 SETTINGS = {
@@ -76,7 +76,7 @@ def require_certificates(tls: Tls) -> None:
         ) from error
 
 
-def security(tls: Tls | None) -> Any:
+def make_security(tls: Tls | None) -> Any:
     """Return the `distributed.Security` with the certificates of `tls`; None without TLS.  Raises ConfigError."""
     if tls is None:
         return None
@@ -105,23 +105,23 @@ WORKERS_INTERVAL_S = 5.0  # time between two checks of the workers
 CONNECT_TIMEOUT_S = 20.0  # maximum time for connecting to a scheduler
 
 
-def work(cell: str, store: str, command: list[str], options: str) -> str:
+def run_cell_on_worker(cell: str, store: str, command: list[str], options: str) -> str:
     """Run a cell on a worker; return its `Outcome` as JSON.  cell, options: as JSON."""
     outcome = run_cell(CellRun.from_json(cell), Store(Path(store)), command, CellOptions(**json.loads(options)))
     return json.dumps(asdict(outcome))
 
 
-def engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
+def open_engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     """Return the engine for `execution`.  Raises DeviceError if there are no devices."""
     os.environ["PYTHONSAFEPATH"] = "1"  # like -P, so that workers import nothing from the working folder
     with ExitStack() as settings:
         settings.enter_context(dask.config.set(SETTINGS))  # until the engine is closed
-        cluster = _engine(execution, store, devices)
+        cluster = _connect(execution, store, devices)
         cluster.settings = settings.pop_all()
         return cluster
 
 
-def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
+def _connect(execution: Execution, store: Store, devices: list[str] | None) -> "Cluster":
     if execution.engine == "local":
         slots = find_slots("local", devices, execution.packing)
         cluster = distributed.LocalCluster(
@@ -137,7 +137,7 @@ def _engine(execution: Execution, store: Store, devices: list[str] | None) -> "C
     warn_about_open_port(execution)
     try:
         client = distributed.Client(
-            execution.address, security=security(execution.tls), set_as_default=False, timeout=CONNECT_TIMEOUT_S
+            execution.address, security=make_security(execution.tls), set_as_default=False, timeout=CONNECT_TIMEOUT_S
         )
     except OSError as error:
         raise scheduler_error(execution, error) from None
@@ -230,7 +230,7 @@ class Cluster:
         worker_address = slot.worker if self._local_slots is None else None
         with self._requires_scheduler():
             future = self._client.submit(
-                work,
+                run_cell_on_worker,
                 cell.json(),
                 str(self._store.root),
                 list(self.make_command(slot.device)),
@@ -305,7 +305,7 @@ async def _serve(execution: Execution, slots: Sequence[DeviceSlot], stop: thread
             execution.address,
             nthreads=1,
             memory_limit=0,
-            security=security(execution.tls),
+            security=make_security(execution.tls),
             host=LOOPBACK if execution.is_local else None,
             metrics={METRIC_KEY: partial(_constant_metric, json.dumps(description))},
             dashboard_address=f"{LOOPBACK}:0",

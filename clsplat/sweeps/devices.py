@@ -27,10 +27,10 @@ from clsplat.pipeline.files import shipped_pipelines
 from clsplat.sweeps.cell import code_digest
 
 LOG = logging.getLogger("clsplat")
-Parts = list[tuple[int, ...]]  # for each run, the cores that it is pinned to; (): all cores
+CoreSets = list[tuple[int, ...]]  # for each run, the cores that it is pinned to; (): all cores
 
 
-def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[Parts]:
+def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[CoreSets]:
     """Assign CPU cores to the runs on each device; return a list of the runs' cores for each device.
 
     packing: number of runs on a CPU; other devices have one run.  Raises ConfigError if there are more runs than cores.
@@ -40,7 +40,7 @@ def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[Part
         raise ConfigError(
             f"execution.packing: {packing} runs cannot share {pluralize(len(cores), 'core')}; set at most {len(cores)}"
         )
-    core_sets: Parts = machine.split_cores(cores, packing) if packing > 1 else [()]
+    core_sets: CoreSets = machine.split_cores(cores, packing) if packing > 1 else [()]
     return [core_sets if info.kind == "CPU" else [()] for info in devices]
 
 
@@ -92,7 +92,7 @@ def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) 
         raise no_device_error("no OpenCL device works", "`clsplat devices` shows why")
     slots = []
     for info, core_sets in zip(subset, split_device_cores(subset, packing), strict=True):
-        bits, memory = bits_class(info, infos), info.memory // len(core_sets)
+        bits, memory = find_bits_class(info, infos), info.memory // len(core_sets)
         slot = DeviceSlot(worker, device_query(info, infos), bits, info.label, memory=memory)
         slots += [replace(slot, cores=cores) for cores in core_sets]
     return slots
@@ -105,7 +105,7 @@ def device_query(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
     return f"{query}:{matches.index(info.index)}"
 
 
-def bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
+def find_bits_class(info: DeviceInfo, infos: list[DeviceInfo]) -> str:
     """Return the bits class of a device; results are cached by device, driver, and program version.
 
     Raises DeviceError if the fixed run fails.

@@ -30,7 +30,7 @@ def store_status(root: Path) -> dict[str, Any]:
     store = Store.open(root)
     now = time.time()
     names = {key: (sweep, name) for sweep, cells in store.sweeps() for name, key in cells.items()}
-    cells = [_cell(folder, names.get(folder.key, ("", "")), now) for folder in store.folders()]
+    cells = [_cell_status(folder, names.get(folder.key, ("", "")), now) for folder in store.folders()]
     cells.sort(key=lambda cell: (cell["sweep"], cell["name"], cell["key"]))
     counts: dict[str, int] = {}
     for cell in cells:
@@ -41,7 +41,7 @@ def store_status(root: Path) -> dict[str, Any]:
     return {"store": str(root), "time": now, "counts": counts, "events": events, "cells": cells}
 
 
-def _cell(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
+def _cell_status(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
     """Return the state of a cell.  names: the name of its sweep, and its name in that sweep."""
     spec: Any = {}
     with suppress(DataError):

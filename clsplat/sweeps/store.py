@@ -106,7 +106,7 @@ LEASE, MANIFEST, PIPELINE_FILE, ERRORS = "lease.json", "manifest.json", "cell.ya
 # files that are not copied to other attempts; PREPARE_SUMMARY contains a path
 ATTEMPT_FILES = frozenset({LEASE, MANIFEST, PIPELINE_FILE, ERRORS, STATUS, LOCK, PREPARE_SUMMARY})
 MEASURED = ("psnr", "ssim", "views")  # values of metrics.json that depend only on bits, not on time
-BEAT = 10.0  # seconds between two heartbeats of a lease
+BEAT_INTERVAL_S = 10.0  # seconds between two heartbeats of a lease
 Rank = tuple[bool, int]  # order of checkpoints: whether it belongs to a refit, and its step
 
 
@@ -128,8 +128,8 @@ class CellAttempt:
         self._write()
 
     def beat(self) -> None:
-        """Renew the lease if it is older than BEAT seconds.  Raises LeaseLost."""
-        if time.monotonic() - self._last >= BEAT:
+        """Renew the lease if it is older than BEAT_INTERVAL_S seconds.  Raises LeaseLost."""
+        if time.monotonic() - self._last >= BEAT_INTERVAL_S:
             self.require_lease()
             self._write()
 
@@ -212,7 +212,7 @@ class CellAttempt:
         cause = f"signal {-exit_code}" if exit_code < 0 else f"exit code {exit_code}"
         return lines[-1].removeprefix("error: ") if lines else f"its process ended with {cause}"
 
-    def manifest(self) -> dict[str, Any]:
+    def write_manifest(self) -> dict[str, Any]:
         """Write and return the manifest, with hashes of all files and of the bits.  Raises OutputError."""
         names = sorted(path.relative_to(self.path).as_posix() for path in self.path.rglob("*") if path.is_file())
         hashed_names = [name for name in names if name not in (LEASE, MANIFEST, ERRORS, LOCK)]
@@ -360,7 +360,7 @@ class CellFolder:
         LeaseLost if the attempt was removed because its process was frozen for too long.
         """
         attempt.require_lease()
-        manifest = attempt.manifest()
+        manifest = attempt.write_manifest()
         with raising_output_error(attempt.path):
             sync_below(attempt.path)
         with suppress(OSError):

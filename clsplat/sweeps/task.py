@@ -23,7 +23,11 @@ from clsplat.sweeps.child import Command, supervise
 from clsplat.sweeps.store import ATTEMPTS, PIPELINE_FILE, BitsMismatch, CellAttempt, CellFolder, LeaseLost, Store
 
 LOG = logging.getLogger("clsplat")
-FINAL = (ConfigError.exit_code, DataError.exit_code, MemoryLimitError.exit_code)  # a retry would fail in the same way
+FINAL_EXIT_CODES = (
+    ConfigError.exit_code,
+    DataError.exit_code,
+    MemoryLimitError.exit_code,
+)  # a retry would fail in the same way
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,7 @@ def _run_cell(
             attempt.end(code)
         if should_stop():
             return Outcome("stopped", "", Interrupted.exit_code, "stopped, its state is saved")
-        if code in FINAL or len(folder.failures(options.since)) >= options.retries:
+        if code in FINAL_EXIT_CODES or len(folder.failures(options.since)) >= options.retries:
             return _give_up(folder, store, code, message)
         LOG.warning("cell %s: %s; trying again", cell.name, message)
 

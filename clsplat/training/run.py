@@ -19,7 +19,7 @@ from clsplat.gaussians.gaussians import HIDDEN, INTERVAL2, DeviceModel
 from clsplat.gaussians.model import Model, Rendering
 from clsplat.losses.base import Loss
 from clsplat.opencl.device import Device
-from clsplat.photos.photographs import Photographs, texture_quantile
+from clsplat.photos.photographs import Photographs, compute_texture_quantile
 from clsplat.render.filters import FilterViews, ModelSettings, measure_intervals
 from clsplat.render.painter import Painter, SplatPainter
 from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
@@ -232,11 +232,11 @@ class Run:
         """Return a survey of the training views for the rules of an edit."""
         return Survey(self.rasterizer, self.model, self.photographs, self.scene.split("train"), self.seed, self.step)
 
-    def texture_quantile(self, q: float) -> float:
+    def compute_texture_quantile(self, q: float) -> float:
         """Return the quantile `q` of the gradient magnitude, px⁻¹, over the pixels of all training photographs."""
         if q not in self._texture_quantiles:
             photographs = (self.photographs.get(view) for view in self.scene.split("train"))
-            self._texture_quantiles[q] = texture_quantile(self.rasterizer.workspace, photographs, q)
+            self._texture_quantiles[q] = compute_texture_quantile(self.rasterizer.workspace, photographs, q)
         return self._texture_quantiles[q]
 
     def training_images(self) -> Iterator[NDArray[np.uint8]]:

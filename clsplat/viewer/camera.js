@@ -6,7 +6,7 @@ const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const scaled = (a, f) => a.map(v => v * f);
 const size = a => Math.hypot(...a);
-const unit = a => scaled(a, 1 / (size(a) || 1));
+const normalized = a => scaled(a, 1 / (size(a) || 1));
 const mix = (a, b, t) => a.map((v, i) => v + (b[i] - v) * t);
 const axis = (camera, i) => camera.rotation.slice(3 * i, 3 * i + 3); // right, down, forward in the world
 
@@ -37,20 +37,20 @@ function rotationOf([x, y, z, w]) {
     2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
 }
 
-function between(a, b, t) { // interpolate between two cameras
+function interpolateCameras(a, b, t) { // t: 0 returns a, 1 returns b
   if (t >= 1) return b;
   let p = quaternion(a.rotation), q = quaternion(b.rotation);
   let cosine = p.reduce((sum, v, i) => sum + v * q[i], 0);
   if (cosine < 0) [q, cosine] = [scaled(q, -1), -cosine];
   const angle = Math.acos(Math.min(1, cosine)), sine = Math.sin(angle);
   const [f, g] = sine < 1e-6 ? [1 - t, t] : [Math.sin((1 - t) * angle) / sine, Math.sin(t * angle) / sine];
-  const turned = p.map((v, i) => f * v + g * q[i]);
-  const rotation = rotationOf(scaled(turned, 1 / size(turned)));
+  const rotated = p.map((v, i) => f * v + g * q[i]);
+  const rotation = rotationOf(scaled(rotated, 1 / size(rotated)));
   return {rotation, eye: mix(a.eye, b.eye, t), lens: mix(a.lens, b.lens, t)};
 }
 
 // Rotate a camera by an angle about an axis of the world through a point.
-function turned(camera, about, angle, center) {
+function rotated(camera, about, angle, center) {
   const c = Math.cos(angle), s = Math.sin(angle);
   const turn = v => add(add(scaled(v, c), cross(about, v), s), about, dot(about, v) * (1 - c));
   return {...camera, eye: add(center, turn(add(camera.eye, center, -1))),
@@ -58,15 +58,15 @@ function turned(camera, about, angle, center) {
 }
 
 // Remove the roll of a camera.
-function leveled(camera, up) {
+function withoutRoll(camera, up) {
   const forward = axis(camera, 2), right = cross(forward, up);
   if (size(right) < 1e-3) return camera;
-  const across = unit(right);
+  const across = normalized(right);
   return {...camera, rotation: [...across, ...cross(forward, across), ...forward]};
 }
 
 // The area of a canvas of width x height px that the camera's image fills: scale, left and top.
-function fitted(lens, width, height) {
+function fitToCanvas(lens, width, height) {
   const enlarged = Math.min(width / lens[4], height / lens[5]);
   return {enlarged, left: (width - enlarged * lens[4]) / 2, top: (height - enlarged * lens[5]) / 2};
 }
@@ -74,8 +74,8 @@ function fitted(lens, width, height) {
 // The values of a camera on a canvas for the shaders.  exact: clamp rays as `clsplat render` does for the camera's
 // image; otherwise clamp them beyond the canvas, which shows more than that image.  native: the focal length with a
 // scale of 1.
-function framed(camera, width, height, exact, native = 1) {
-  const [fx, fy, cx, cy, w, h] = camera.lens, {enlarged, left, top} = fitted(camera.lens, width, height);
+function makeFrame(camera, width, height, exact, native = 1) {
+  const [fx, fy, cx, cy, w, h] = camera.lens, {enlarged, left, top} = fitToCanvas(camera.lens, width, height);
   const intrinsics = [fx * enlarged, fy * enlarged, cx * enlarged + left, cy * enlarged + top];
   const [x, y, u, v, across, down] = exact ? camera.lens : [...intrinsics, width, height];
   const margin = [0.3 * across / (2 * x), 0.3 * down / (2 * y)];
@@ -86,15 +86,15 @@ function framed(camera, width, height, exact, native = 1) {
   };
 }
 
-const written = camera => [camera.eye, quaternion(camera.rotation), camera.lens]
+const formatCamera = camera => [camera.eye, quaternion(camera.rotation), camera.lens]
   .map(part => part.map(v => +v.toPrecision(8)).join(",")).join(";");
 
 // Read the camera, and the timestamp if there is one, from the fragment (#) of an address; null if it has no camera.
-function read(text) {
+function parseCamera(text) {
   const parts = text.replace(/^#/, "").split(";").map(part => part.split(",").map(Number));
   if (![3, 4].includes(parts.length) || parts.some((part, i) => part.length !== [3, 4, 6, 1][i])) return null;
   if (!parts.flat().every(Number.isFinite)) return null;
-  const [eye, turn, lens, [moment] = []] = parts;
+  const [eye, turn, lens, [timestamp] = []] = parts;
   if (size(turn) < 1e-6 || [lens[0], lens[1], lens[4], lens[5]].some(v => v <= 0)) return null;
-  return {eye, rotation: rotationOf(scaled(turn, 1 / size(turn))), lens, moment};
+  return {eye, rotation: rotationOf(scaled(turn, 1 / size(turn))), lens, timestamp};
 }

@@ -1,6 +1,6 @@
 // Pointer, wheel, touch and keyboard.  They change `viewer.camera` with `viewer.move`, which leaves a photo's view.
 
-const TURN = 0.005, LEAST_TILT = 0.06; // radians per px; smallest angle between the view direction and up
+const TURN = 0.005, MIN_TILT = 0.06; // radians per px; smallest angle between the view direction and up
 const KEYS = {w: [2, 1], s: [2, -1], a: [0, -1], d: [0, 1], q: [1, 1], e: [1, -1]}; // axis and sign
 
 class Controls {
@@ -47,19 +47,19 @@ class Controls {
 
   // Tilt about the right axis, but not beyond the zenith.
   tilt(camera, angle, center) {
-    const after = turned(camera, axis(camera, 0), angle, center);
-    const toward = Math.abs(dot(axis(after, 2), this.viewer.up));
-    return toward > Math.cos(LEAST_TILT) && toward > Math.abs(dot(axis(camera, 2), this.viewer.up)) ? camera : after;
+    const after = rotated(camera, axis(camera, 0), angle, center);
+    const cosine = Math.abs(dot(axis(after, 2), this.viewer.up));
+    return cosine > Math.cos(MIN_TILT) && cosine > Math.abs(dot(axis(camera, 2), this.viewer.up)) ? camera : after;
   }
 
   orbit([x, y]) {
     const {camera, up, pivot} = this.viewer;
-    this.viewer.move(this.tilt(turned(camera, up, -x * TURN, pivot), -y * TURN, pivot));
+    this.viewer.move(this.tilt(rotated(camera, up, -x * TURN, pivot), -y * TURN, pivot));
   }
 
   look([x, y]) {
     const {camera, up} = this.viewer;
-    this.viewer.move(this.tilt(turned(camera, up, x * TURN / 2, camera.eye), y * TURN / 2, camera.eye));
+    this.viewer.move(this.tilt(rotated(camera, up, x * TURN / 2, camera.eye), y * TURN / 2, camera.eye));
     this.viewer.pivot = this.ahead(this.viewer.camera);
   }
 
@@ -91,7 +91,8 @@ class Controls {
     let by = [0, 0, 0];
     for (const key of this.pressed) if (KEYS[key]) by = add(by, axis(this.viewer.camera, KEYS[key][0]), KEYS[key][1]);
     if (size(by) < 1e-6) return false;
-    this.shift(scaled(unit(by), this.viewer.radius * Math.min(0.1, seconds) * (this.pressed.has("shift") ? 2 : 0.5)));
+    const speed = this.viewer.radius * (this.pressed.has("shift") ? 2 : 0.5); // per second
+    this.shift(scaled(normalized(by), Math.min(0.1, seconds) * speed));
     return true;
   }
 
@@ -106,7 +107,7 @@ class Controls {
     const action = {
       arrowleft: () => viewer.photographs.step(-1), arrowright: () => viewer.photographs.step(1),
       p: () => viewer.photographs.cycle(), r: () => viewer.reset(),
-      l: () => viewer.move(leveled(viewer.camera, viewer.up)),
+      l: () => viewer.move(withoutRoll(viewer.camera, viewer.up)),
       o: () => viewer.panel.style(this.style === "orbit" ? "fly" : "orbit"), h: () => viewer.panel.hide(),
       g: () => viewer.panel.cameras(!viewer.frustums.shown),
       f: () => viewer.panel.fullscreen(), c: () => viewer.screenshot(), "?": () => viewer.panel.help(),

@@ -3,7 +3,7 @@
 const BLOCK = 256, ROW = 4096; // splats per block; texels per row of a texture, which phones support
 
 // Decode the text of a script element piece by piece, so that a large page needs no second copy of it.
-function* decoded(text) {
+function* decodePieces(text) {
   const step = 1 << 20;
   for (let begin = 0; begin < text.length; begin += step) {
     const letters = atob(text.slice(begin, begin + step)), bytes = new Uint8Array(letters.length);
@@ -12,14 +12,14 @@ function* decoded(text) {
   }
 }
 
-async function inflated(text) {
+async function inflate(text) {
   if (!self.DecompressionStream) throw Error("this browser is too old: it has no DecompressionStream");
   const stream = new DecompressionStream("gzip"), writer = stream.writable.getWriter();
-  const written = (async () => {
-    for (const bytes of decoded(text)) await writer.write(bytes);
+  const writing = (async () => {
+    for (const bytes of decodePieces(text)) await writer.write(bytes);
     await writer.close();
   })();
-  return (await Promise.all([new Response(stream.readable).arrayBuffer(), written]))[0];
+  return (await Promise.all([new Response(stream.readable).arrayBuffer(), writing]))[0];
 }
 
 // texels of 16 bytes for the colors of a splat: 3 (degree + 1)² codes
@@ -28,13 +28,14 @@ const splatsInRow = texels => Math.floor(ROW / texels);
 const rowsOf = (count, texels) => Math.max(1, Math.ceil(count / splatsInRow(texels)));
 
 // An array for a texture with complete rows.
-const padded = (kind, count, texels, each) => new kind(rowsOf(count, texels) * splatsInRow(texels) * texels * each);
+const paddedArray = (kind, count, texels, each) =>
+  new kind(rowsOf(count, texels) * splatsInRow(texels) * texels * each);
 
-// header, buffer: from packing.py; most: largest number of rows of a texture; the least important splats that exceed
+// header, buffer: from packing.py; maxRows: largest number of rows of a texture; the least important splats that exceed
 // it are dropped.
-function unpacked(header, buffer, most) {
+function unpackModel(header, buffer, maxRows) {
   const whole = header.count, texels = colorTexels(header.degree);
-  const count = Math.min(whole, most * splatsInRow(texels), most * ROW);
+  const count = Math.min(whole, maxRows * splatsInRow(texels), maxRows * ROW);
   let place = 0;
   const take = (kind, length) => {
     const part = new kind(buffer, place, length);
@@ -47,7 +48,7 @@ function unpacked(header, buffer, most) {
   place += 4 * whole;
   const shapes = take(Uint8Array, 4 * whole), codes = take(Uint8Array, 3 * (header.degree + 1) ** 2 * whole);
 
-  const positions = new Float32Array(3 * count), places = padded(Uint32Array, count, 1, 4);
+  const positions = new Float32Array(3 * count), places = paddedArray(Uint32Array, count, 1, 4);
   const floats = new Float32Array(places.buffer);
   for (let i = 0; i < count; i++) {
     const block = 6 * Math.floor(i / BLOCK);
@@ -59,17 +60,18 @@ function unpacked(header, buffer, most) {
     }
     places[4 * i + 3] = quats[i];
   }
-  const sizes = interleaved(shapes, whole, count, 4, padded(Uint8Array, count, 1, 4), 4);
-  const each = 16 * texels, motion = header.motion && moved(header.motion.columns, buffer, place, whole, count);
-  const colors = interleaved(codes, whole, count, codes.length / whole, padded(Uint8Array, count, texels, 16), each);
+  const sizes = interleave(shapes, whole, count, 4, paddedArray(Uint8Array, count, 1, 4), 4);
+  const each = 16 * texels, motion = header.motion && unpackMotion(header.motion.columns, buffer, place, whole, count);
+  const padded = paddedArray(Uint8Array, count, texels, 16);
+  const colors = interleave(codes, whole, count, codes.length / whole, padded, each);
   return {count, whole, texels, tables, positions, motion, places, sizes: new Uint32Array(sizes.buffer),
     colors: new Uint32Array(colors.buffer)};
 }
 
 // Planes [columns, whole] of half floats as rows of texels: {rows, wide: texels of a row}.
-function moved(columns, buffer, place, whole, count) {
+function unpackMotion(columns, buffer, place, whole, count) {
   const bytes = new Uint8Array(buffer, place, 2 * columns * whole), wide = Math.ceil(columns / 4);
-  const rows = padded(Float32Array, count, wide, 4);
+  const rows = paddedArray(Float32Array, count, wide, 4);
   for (let column = 0; column < columns; column++) {
     for (let i = 0; i < count; i++) {
       const from = 2 * (column * whole + i), half = bytes[from] + 256 * bytes[from + 1];
@@ -85,7 +87,7 @@ const halfFloat = half => {
 };
 
 // Planes [number, whole] of bytes as `each` bytes of a splat.
-function interleaved(planes, whole, count, number, out, each) {
+function interleave(planes, whole, count, number, out, each) {
   for (let plane = 0; plane < number; plane++) {
     for (let i = 0, from = plane * whole, to = plane; i < count; i++, from++, to += each) out[to] = planes[from];
   }

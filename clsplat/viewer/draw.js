@@ -68,7 +68,7 @@ class Painter {
     return surface;
   }
 
-  // Upload the textures of a model.  data: from `unpacked`.
+  // Upload the textures of a model.  data: from `unpackModel`.
   layer(header, data) {
     const gl = this.gl, rows = rowsOf(data.count, 1), words = gl.RGBA_INTEGER;
     const wide = splatsInRow(data.texels) * data.texels, high = rowsOf(data.count, data.texels);
@@ -117,21 +117,21 @@ class Painter {
   }
 
   // Set the uniforms of a program for the motion of a layer at a timestamp.
-  move(used, layer, moment) {
+  move(used, layer, timestamp) {
     if (!layer.motions) return;
     const {bends, turns} = layer.header.motion;
     const numbers = {wide: layer.wide, bends, turns};
     for (const [name, number] of Object.entries(numbers)) this.gl.uniform1i(used.at(name), number);
-    this.gl.uniform1f(used.at("moment"), moment);
+    this.gl.uniform1f(used.at("timestamp"), timestamp);
   }
 
   // Compute the colors of the first splats, unless they were computed for this camera position and timestamp.
-  shade(layer, eye, first, moment) {
-    const key = [...eye, first, layer.motions ? moment : 0].join(), gl = this.gl, used = layer.colors;
+  shade(layer, eye, first, timestamp) {
+    const key = [...eye, first, layer.motions ? timestamp : 0].join(), gl = this.gl, used = layer.colors;
     if (key === layer.key) return;
     layer.key = key;
     this.bind(used, {tables: layer.tables, places: layer.places, codes: layer.codes, ...motionTexture(layer)});
-    this.move(used, layer, moment);
+    this.move(used, layer, timestamp);
     gl.uniform3fv(used.at("eye"), eye);
     gl.uniform1i(used.at("degree"), layer.header.degree);
     gl.uniform1i(used.at("texels"), layer.texels);
@@ -143,10 +143,10 @@ class Painter {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Blend a layer into a surface of the size of `frame`, which `framed` of camera.js returns.
-  blend(layer, frame, {mode = "splats", first = layer.count, dot = 1.5, moment = 0} = {}) {
+  // Blend a layer into a surface of the size of `frame`, which `makeFrame` of camera.js returns.
+  blend(layer, frame, {mode = "splats", first = layer.count, dot = 1.5, timestamp = 0} = {}) {
     const gl = this.gl, used = layer.splats, {header} = layer, {width, height} = frame;
-    this.shade(layer, frame.eye, first, moment);
+    this.shade(layer, frame.eye, first, timestamp);
     const target = this.sized(width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
     gl.viewport(0, 0, width, height);
@@ -154,7 +154,7 @@ class Painter {
     gl.clear(gl.COLOR_BUFFER_BIT);
     const shapes = {tables: layer.tables, places: layer.places, sizes: layer.sizes, colors: layer.shown.texture};
     this.bind(used, {...shapes, ...motionTexture(layer)});
-    this.move(used, layer, moment);
+    this.move(used, layer, timestamp);
     gl.uniformMatrix3fv(used.at("rotation"), true, frame.rotation);
     gl.uniform3fv(used.at("translation"), frame.translation);
     gl.uniform4fv(used.at("intrinsics"), frame.intrinsics);

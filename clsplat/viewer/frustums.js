@@ -16,37 +16,37 @@ class Frustums {
     if (!views.length) find("cameras").previousElementSibling.hidden = find("cameras").hidden = true;
   }
 
-  // frame: from `framed`, for a pane of that size in CSS px; corners: left and top of each pane
+  // frame: from `makeFrame`, for a pane of that size in CSS px; corners: left and top of each pane
   draw(frame, corners, ratio) {
-    const pen = this.canvas.getContext("2d"), {width, height} = this.viewer.canvas;
+    const context = this.canvas.getContext("2d"), {width, height} = this.viewer.canvas;
     this.canvas.hidden = !this.shown;
     if (!this.shown) return;
     Object.assign(this.canvas, {width, height}); // and empties it
     for (const [left, top] of corners) {
-      pen.setTransform(ratio, 0, 0, ratio, left * ratio, top * ratio);
-      pen.lineWidth = 1.3;
+      context.setTransform(ratio, 0, 0, ratio, left * ratio, top * ratio);
+      context.lineWidth = 1.3;
       for (const {points, color} of this.shapes) {
-        pen.strokeStyle = color;
-        this.pyramid(pen, points.map(point => projected(frame, point)));
+        context.strokeStyle = color;
+        this.pyramid(context, points.map(point => projectPoint(frame, point)));
       }
     }
   }
 
-  pyramid(pen, points) {
+  pyramid(context, points) {
     if (!points.every(Boolean)) return;
     const [tip, ...corners] = points;
-    pen.beginPath();
+    context.beginPath();
     corners.forEach((corner, i) => {
-      pen.moveTo(...tip);
-      pen.lineTo(...corner);
-      pen.lineTo(...corners[(i + 1) % 4]);
+      context.moveTo(...tip);
+      context.lineTo(...corner);
+      context.lineTo(...corners[(i + 1) % 4]);
     });
-    pen.stroke();
+    context.stroke();
   }
 }
 
 // Project a point of the world to the canvas of a frame; null if it is behind the camera.
-function projected({rotation, translation, intrinsics: [fx, fy, cx, cy]}, point) {
+function projectPoint({rotation, translation, intrinsics: [fx, fy, cx, cy]}, point) {
   const [x, y, z] = [0, 1, 2].map(i => dot(rotation.slice(3 * i, 3 * i + 3), point) + translation[i]);
   return z > 0 ? [fx * x / z + cx, fy * y / z + cy] : null;
 }

@@ -1,6 +1,6 @@
 // The camera of a page: moved by the controls, flown to a view, stored in the address.
 
-class Walk {
+class PageCamera {
   constructor(info, canvas) {
     Object.assign(this, {info, canvas, stage: canvas.parentElement, up: info.up, radius: info.radius, at: -1});
     this.camera = cameraOf(info.start);
@@ -8,12 +8,12 @@ class Walk {
   }
 
   // Read the camera and the timestamp from the address; return whether it has a camera.
-  adopt() {
-    const camera = location.hash === this.hash ? null : read(location.hash);
+  readAddress() {
+    const camera = location.hash === this.hash ? null : parseCamera(location.hash);
     if (camera) this.move(camera);
-    if (camera && this.clock && camera.moment !== undefined) {
+    if (camera && this.clock && camera.timestamp !== undefined) {
       this.clock.stop();
-      this.clock.to(camera.moment);
+      this.clock.to(camera.timestamp);
     }
     return !!camera;
   }
@@ -54,7 +54,7 @@ class Walk {
 
   get focal() { // CSS px
     const {width, height} = this.pane();
-    return this.camera.lens[0] * fitted(this.camera.lens, width, height).enlarged;
+    return this.camera.lens[0] * fitToCanvas(this.camera.lens, width, height).enlarged;
   }
 
   advance(time) {
@@ -63,12 +63,12 @@ class Walk {
       [this.camera, this.at, this.flight] = [to, view, null];
       this.changed = performance.now();
       if (view >= 0) this.photographs.arrived();
-    } else this.camera = between(from, to, Math.max(0, t * t * (3 - 2 * t)));
+    } else this.camera = interpolateCameras(from, to, Math.max(0, t * t * (3 - 2 * t)));
   }
 
   // The camera is at rest: store it in the address.
-  remember() {
-    const text = `#${written(this.camera)}${this.clock ? `;${+this.moment.toFixed(4)}` : ""}`;
+  storeInAddress() {
+    const text = `#${formatCamera(this.camera)}${this.clock ? `;${+this.timestamp.toFixed(4)}` : ""}`;
     if (text === location.hash) return;
     this.hash = text;
     try { history.replaceState(null, "", text); } catch { /* too frequent, or not allowed: keep the address */ }

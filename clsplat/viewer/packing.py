@@ -76,14 +76,14 @@ def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating
     order = _draw_order(model, limit)
     sky_count = int((order >= scene_count).sum())
     model = model[order]
-    frame = _frame(model.means.astype(np.float64))
+    frame = _find_frame(model.means.astype(np.float64))
     count = len(model)
     logs = model.log_scales.astype(np.float64)
     logs = np.maximum(logs, logs.max(axis=1, keepdims=True) - MAX_LOG_RATIO)
     scales, opacity, base = (_value_table(values) for values in (logs, model.opacities, model.sh_base))
     rest = _quantization_table(float(max(model.sh_rest.max(initial=0.0), -model.sh_rest.min(initial=0.0))))
     tables = np.stack([np.exp(np.minimum(scales, MAX_LOG)), opacity, base, rest]).astype("<f4")
-    planes: list[NDArray[Any]] = [tables, *_positions(_logarithmic(model.means, *frame)), _quaternions(model.quats)]
+    planes: list[NDArray[Any]] = [tables, *_pack_positions(_logarithmic(model.means, *frame)), _pack_quats(model.quats)]
     pairs = (scales, logs), (opacity, model.opacities[:, None]), (base, model.sh_base), (rest, model.sh_rest)
     planes += [_nearest_indices(table, column) for table, values in pairs for column in values.T]
     header = {
@@ -100,7 +100,7 @@ def pack(model: Model, limit: int | None = None, sky_center: NDArray[np.floating
         "levels": [count * (level + 1) // LEVELS for level in range(LEVELS)],
     }
     if model.motion is not None:
-        planes.append(_motion(model.motion, model.quats))
+        planes.append(_pack_motion(model.motion, model.quats))
         header["motion"] = _motion_header(model.motion.shape[1])
     data = b"".join(np.ascontiguousarray(plane).tobytes() for plane in planes)
     return PackedModel(header, gzip.compress(data, 7, mtime=0))
@@ -122,13 +122,13 @@ def _draw_order(model: Model, limit: int | None) -> NDArray[np.intp]:
     means = model.means[indices].astype(np.float64)
     areas = np.sort(model.log_scales[indices].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
     by_importance = np.argsort(-(areas + np.log(model.opacities[indices].astype(np.float64))), kind="stable")[:limit]
-    points = _logarithmic(means, *_frame(means))
+    points = _logarithmic(means, *_find_frame(means))
     borders = [len(by_importance) * level // LEVELS for level in range(LEVELS + 1)]
     parts = [by_importance[begin:end] for begin, end in itertools.pairwise(borders)]
     return np.asarray(indices[np.concatenate([part[morton_order(points[part])] for part in parts])])
 
 
-def _frame(means: Floats) -> tuple[Floats, float]:
+def _find_frame(means: Floats) -> tuple[Floats, float]:
     """Return the median position, [3], and the median absolute deviation over all axes, rounded to float32."""
     if not len(means):
         return np.zeros(3), 1.0
@@ -137,12 +137,12 @@ def _frame(means: Floats) -> tuple[Floats, float]:
 
 
 def _logarithmic(means: NDArray[np.floating], origin: Floats, unit: float) -> Floats:
-    """Return the logarithmic coordinates t of positions, [N, 3]."""
+    """Return the logarithmic coordinates of positions, [N, 3]: sign(d) log(1 + |d|), d = (position - origin) / unit."""
     offsets = (means.astype(np.float64) - origin) / unit
     return np.asarray(np.sign(offsets) * np.log1p(np.abs(offsets)))
 
 
-def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
+def _pack_positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
     """Return the smallest coordinates and step sizes of blocks, [B, 6], and the coordinates in steps, [6, N] bytes."""
     starts = np.arange(0, len(means), BLOCK)
     low = np.minimum.reduceat(means, starts) if len(means) else np.empty((0, 3))
@@ -154,25 +154,25 @@ def _positions(means: Floats) -> tuple[NDArray[np.float32], Bytes]:
     return blocks, np.concatenate([codes & 255, codes >> 8]).astype(np.uint8)
 
 
-def _quaternions(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
+def _pack_quats(quats: NDArray[np.float32]) -> NDArray[np.unsignedinteger]:
     """Return the packed unit quaternions, [N], each with the sign that makes its largest component positive."""
-    unit = np.roll(quats.astype(np.float64), -1, axis=1)
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    largest_index, smaller = smallest_three(unit)
+    rolled = np.roll(quats.astype(np.float64), -1, axis=1)
+    rolled /= np.linalg.norm(rolled, axis=1, keepdims=True)
+    largest_index, others = smallest_three(rolled)
     max_code = 2**BITS - 1
-    codes = np.rint((smaller * np.sqrt(0.5) + 0.5) * max_code).clip(0, max_code).astype(np.uint32)
+    codes = np.rint((others * np.sqrt(0.5) + 0.5) * max_code).clip(0, max_code).astype(np.uint32)
     shifts = np.array([2 * BITS, BITS, 0], np.uint32)
     words = (codes << shifts).sum(axis=1, dtype=np.uint32) | (largest_index.astype(np.uint32) << np.uint32(30))
     return np.asarray(words, "<u4")
 
 
-def _motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArray[np.float16]:
+def _pack_motion(motion: NDArray[np.floating], quats: NDArray[np.floating]) -> NDArray[np.float16]:
     """Return the columns of the motion, [columns, N], with rotations relative to the stored quaternions."""
     columns = motion.astype(np.float64)
     if (rotation := motion_fields(motion.shape[1]).get("turn")) is not None:
-        unit = np.roll(quats.astype(np.float64), -1, axis=1)
-        largest_component = np.take_along_axis(unit, np.abs(unit).argmax(axis=1)[:, None], axis=1)
-        norm = np.linalg.norm(unit, axis=1, keepdims=True) * np.where(largest_component < 0, -1.0, 1.0)
+        rolled = np.roll(quats.astype(np.float64), -1, axis=1)
+        largest_component = np.take_along_axis(rolled, np.abs(rolled).argmax(axis=1)[:, None], axis=1)
+        norm = np.linalg.norm(rolled, axis=1, keepdims=True) * np.where(largest_component < 0, -1.0, 1.0)
         columns[:, rotation] = np.roll(columns[:, rotation], -1, axis=1) / norm
     return columns.clip(-MAX_HALF, MAX_HALF).astype("<f2").T
 

@@ -78,7 +78,7 @@ class Page:
             "first": first_view,
             "background": COLORS[self.background],
             "file": re.sub(r"[^\w.-]+", "_", self.title),
-            **({"moments": self._timestamps} if self.is_moving else {}),
+            **({"timestamps": self._timestamps} if self.is_moving else {}),
         }
         return render(
             "viewer.html.j2",
@@ -87,8 +87,8 @@ class Page:
             models=[base64.b64encode(packed.data).decode() for packed in self.models.values()],
             facts=self._facts(),
             background=self.background,
-            style=inline(style()),
-            script=inline(script()),
+            style=inline(read_style()),
+            script=inline(read_script()),
         )
 
     @property
@@ -148,8 +148,8 @@ def is_viewer(path: Path) -> bool:
     return MARK in read_file(path)
 
 
-def script() -> str:
-    """Return the scripts of the page as one function."""
+def read_script() -> str:
+    """Read the scripts of the page and join them into one JavaScript function."""
     return join_scripts(SCRIPTS)
 
 
@@ -159,8 +159,8 @@ def join_scripts(names: Sequence[str], sources: Sequence[str] = ()) -> str:
     return '(() => {\n"use strict";\n' + "\n".join(parts) + "})();\n"
 
 
-def style() -> str:
-    """Return the style of the page."""
+def read_style() -> str:
+    """Read the style sheet of the page."""
     return (FOLDER / "viewer.css").read_text("utf-8")
 
 

@@ -1,7 +1,7 @@
 // The controls around the image: buttons, help, the name of the view.
 
 const find = name => document.getElementById(name);
-const press = (group, key, value) => {
+const markPressed = (group, key, value) => {
   for (const button of find(group).querySelectorAll("button")) {
     button.setAttribute("aria-pressed", button.dataset[key] === value);
   }
@@ -9,7 +9,7 @@ const press = (group, key, value) => {
 const choices = (group, key, action) => find(group).addEventListener("click", ({target}) => {
   if (target.dataset[key]) action(target.dataset[key]);
 });
-const thousands = number => number.toLocaleString("en");
+const formatCount = number => number.toLocaleString("en");
 const CAPTION_MS = 4000;
 
 class Panel {
@@ -48,17 +48,17 @@ class Panel {
 
   style(style) {
     this.viewer.controls.style = style;
-    press("styles", "style", style);
+    markPressed("styles", "style", style);
   }
 
   cameras(shown) {
     this.viewer.frustums.shown = shown;
-    press("cameras", "cameras", shown ? "shown" : "hidden");
+    markPressed("cameras", "cameras", shown ? "shown" : "hidden");
     this.viewer.change();
   }
 
   // Show a message in the caption for a while.
-  tell(text) {
+  showMessage(text) {
     const caption = find("caption");
     caption.textContent = text;
     setTimeout(() => { if (caption.textContent === text) caption.textContent = ""; }, CAPTION_MS);

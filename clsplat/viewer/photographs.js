@@ -1,6 +1,6 @@
 // The filmstrip of views, and the photo of the chosen view over the render.
 
-const COMPARISONS = ["off", "slider", "blink", "fade"], BLINK = 600; // ms
+const COMPARISONS = ["off", "slider", "blink", "fade"], BLINK_MS = 600;
 
 // The prefix that all names share, up to a separator, such as "images/IMG_2024_".
 function commonPrefix([first = "", ...others]) {
@@ -91,11 +91,11 @@ class Photographs {
 
   compare(comparison) {
     this.comparison = comparison;
-    press("comparison", "comparison", comparison);
+    markPressed("comparison", "comparison", comparison);
     this.range.hidden = comparison !== "fade";
     clearInterval(this.timer);
     this.lit = true;
-    if (comparison === "blink") this.timer = setInterval(() => { this.lit = !this.lit; this.place(); }, BLINK);
+    if (comparison === "blink") this.timer = setInterval(() => { this.lit = !this.lit; this.place(); }, BLINK_MS);
     this.place();
   }
 
@@ -107,7 +107,7 @@ class Photographs {
   place() {
     if (this.frame.hidden || this.chosen < 0) return;
     const {width, height} = this.viewer.pane(), {lens} = this.views[this.chosen];
-    const {enlarged, left, top} = fitted(lens, width, height);
+    const {enlarged, left, top} = fitToCanvas(lens, width, height);
     const box = {left, top, width: lens[4] * enlarged, height: lens[5] * enlarged};
     for (const [name, length] of Object.entries(box)) this.frame.style[name] = `${length}px`;
     const shown = this.comparison !== "off" && this.image.hasAttribute("src");

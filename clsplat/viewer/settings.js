@@ -16,13 +16,13 @@ class Settings extends Panel {
 
   mode(mode) {
     this.viewer.mode = mode;
-    press("modes", "mode", mode);
+    markPressed("modes", "mode", mode);
     this.viewer.change();
   }
 
   background(name) {
     this.viewer.background = {black: [0, 0, 0], white: [1, 1, 1], gray: [0.22, 0.23, 0.26]}[name];
-    press("backgrounds", "background", name);
+    markPressed("backgrounds", "background", name);
     this.viewer.change();
   }
 
@@ -41,9 +41,9 @@ class Settings extends Panel {
   statistics(ms, scale) {
     const {layers} = this.viewer;
     const parts = layers.map(({drawn, header: {name, count, faint, sky}}) =>
-      `${layers.length > 1 ? `${name}: ` : ""}${thousands(drawn)} of ${thousands(count)} splats` +
-      (sky ? `, ${thousands(sky)} of the sky` : "") +
-      (faint ? ` + ${thousands(faint)} too faint to draw` : ""));
+      `${layers.length > 1 ? `${name}: ` : ""}${formatCount(drawn)} of ${formatCount(count)} splats` +
+      (sky ? `, ${formatCount(sky)} of the sky` : "") +
+      (faint ? ` + ${formatCount(faint)} too faint to draw` : ""));
     if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
     if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);
     if (this.viewer.distance) parts.push(`distance of the last two points: ${this.viewer.distance.toPrecision(4)}`);

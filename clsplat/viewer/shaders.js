@@ -18,14 +18,14 @@ vec4 turned(int i, vec4 q) { return q; }`;
 const MOVING_MODEL = `
 uniform sampler2D motions;
 uniform int wide, bends, turns;  // texels of a row; number of coefficients; column of the turn, or 0
-uniform float moment;
+uniform float timestamp;
 float column(int i, int k) {
   int row = 4096 / wide;
   return texelFetch(motions, ivec2((i % row) * wide + k / 4, i / row), 0)[k % 4];
 }
 vec3 three(int i, int k) { return vec3(column(i, k), column(i, k + 1), column(i, k + 2)); }
 vec4 moved(int i, vec3 mean) {
-  float dt = moment - column(i, 3), late = dt * exp(-column(i, 4));
+  float dt = timestamp - column(i, 3), late = dt * exp(-column(i, 4));
   vec3 way = three(i, 0);
   if (bends > 0) way += three(i, 5) * dt;
   if (bends > 1) way += three(i, 8) * dt * dt;
@@ -33,7 +33,7 @@ vec4 moved(int i, vec3 mean) {
 }
 vec4 turned(int i, vec4 q) {
   if (turns == 0) return q;
-  return normalize(q + vec4(three(i, turns), column(i, turns + 3)) * (moment - column(i, 3)));
+  return normalize(q + vec4(three(i, turns), column(i, turns + 3)) * (timestamp - column(i, 3)));
 }`;
 
 // A triangle that covers the target.

@@ -1,14 +1,14 @@
 // Sort splats from back to front in a worker: two counting sorts of 16 bits order depths exactly, since the bits of
 // positive floats are ordered as their values.  Splats in front of the near plane are dropped.
 
-// The presence of splat i at a time dt after the time at which it is most opaque; motion: {rows, stride, bends}.
-function presence({rows, stride}, i, dt) {
+// The factor of the opacity of splat i at a time dt after its most opaque time; motion: {rows, stride, bends}.
+function opacityFactor({rows, stride}, i, dt) {
   const late = dt * Math.exp(-rows[i * stride + 4]);
   return Math.exp(-late * late / 2);
 }
 
 // Its displacement along an axis at that time.
-function way({rows, stride, bends}, i, axis, dt) {
+function displacement({rows, stride, bends}, i, axis, dt) {
   const k = i * stride + axis, bend = bends > 0 ? rows[k + 5] + (bends > 1 ? rows[k + 8] * dt : 0) : 0;
   return dt * (rows[k] + dt * bend);
 }
@@ -29,18 +29,18 @@ function sortInWorker() {
   }
 
   // The positions at a timestamp; NaN for splats that are invisible then.
-  function at(moment) {
+  function at(timestamp) {
     for (let i = 0; 3 * i < positions.length; i++) {
-      const dt = moment - motion.rows[i * motion.stride + 3], gone = presence(motion, i, dt) < 1 / 255;
+      const dt = timestamp - motion.rows[i * motion.stride + 3], isInvisible = opacityFactor(motion, i, dt) < 1 / 255;
       for (let axis = 0; axis < 3; axis++) {
-        now[3 * i + axis] = gone ? NaN : positions[3 * i + axis] + way(motion, i, axis, dt);
+        now[3 * i + axis] = isInvisible ? NaN : positions[3 * i + axis] + displacement(motion, i, axis, dt);
       }
     }
     return now;
   }
 
-  function sorted({row, near, first, moment}) {
-    const places = motion ? at(moment) : positions;
+  function sortIds({row, near, first, timestamp}) {
+    const places = motion ? at(timestamp) : positions;
     const [x, y, z, w] = row, depths = new Float32Array(keys.buffer);
     let count = 0;
     for (let i = 0; i < first; i++) {
@@ -61,7 +61,7 @@ function sortInWorker() {
       now = motion && new Float32Array(positions.length);
       [keys, ids, otherKeys, otherIds] = Array.from({length: 4}, () => new Uint32Array(positions.length / 3));
     } else {
-      const order = sorted(data);
+      const order = sortIds(data);
       postMessage({order, first: data.first, number: data.number}, [order.buffer]);
     }
   };
@@ -71,7 +71,7 @@ function sortInWorker() {
 class Sorter {
   // motion: {rows, stride, bends} of a moving model
   constructor(positions, motion, near, done) {
-    const code = `${presence}\n${way}\n(${sortInWorker})()`;
+    const code = `${opacityFactor}\n${displacement}\n(${sortInWorker})()`;
     const source = URL.createObjectURL(new Blob([code], {type: "text/javascript"}));
     this.worker = new Worker(source);
     URL.revokeObjectURL(source);
@@ -87,11 +87,11 @@ class Sorter {
     };
   }
 
-  // row: the third row of world_to_camera; first: number of splats, most important first; moment: timestamp
-  ask(row, first, moment) {
-    const key = [...row, first, moment].join();
+  // row: the third row of world_to_camera; first: number of splats, most important first; timestamp: in [0, 1]
+  ask(row, first, timestamp) {
+    const key = [...row, first, timestamp].join();
     if (key === this.key) return;
-    Object.assign(this, {key, row, first, moment});
+    Object.assign(this, {key, row, first, timestamp});
     this.number++;
     this.current = false;
     if (!this.busy) this.send();
@@ -99,7 +99,7 @@ class Sorter {
 
   send() {
     this.busy = true;
-    const {row, near, first, moment, number} = this;
-    this.worker.postMessage({row, near, first, moment, number});
+    const {row, near, first, timestamp, number} = this;
+    this.worker.postMessage({row, near, first, timestamp, number});
   }
 }

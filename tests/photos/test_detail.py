@@ -10,7 +10,7 @@ from clsplat.core.errors import ConfigError
 from clsplat.core.schedule import Decay
 from clsplat.density.budget import BudgetContext
 from clsplat.methods.dash import Momentum
-from clsplat.photos.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, describe_sizes, knots
+from clsplat.photos.detail import KNOTS, LEVELS, DetailDivisor, Spectrum, compute_knots, describe_sizes
 from clsplat.photos.sampling import ViewSettings
 from clsplat.pipeline.loading import load
 from clsplat.training.adam import Rates
@@ -21,14 +21,14 @@ NATURAL = Spectrum(BOUNDS)  # amplitudes that fall as 1 / frequency
 
 
 def test_flat_spectrum_begins_with_a_quarter_of_the_pixels():
-    steps, divisors = knots([NOISE, NOISE], 27000, 8)
+    steps, divisors = compute_knots([NOISE, NOISE], 27000, 8)
     amplitudes = [0.25 + 0.75 * i / (KNOTS - 1) for i in range(KNOTS)]
     assert divisors == pytest.approx([a**-0.5 for a in amplitudes], rel=2e-3)
     assert steps == pytest.approx([27000 * math.log(4 * a) / math.log(4) for a in amplitudes], rel=2e-3, abs=1e-6)
 
 
 def test_natural_spectrum_begins_with_a_sixteenth():
-    steps, divisors = knots([NATURAL], 6000, 8)
+    steps, divisors = compute_knots([NATURAL], 6000, 8)
     assert divisors[0] == pytest.approx(4, rel=2e-3)
     middle = 0.25 + 0.75 * 10 / (KNOTS - 1)
     assert (divisors[10], steps[10]) == (
@@ -38,8 +38,8 @@ def test_natural_spectrum_begins_with_a_sixteenth():
 
 
 def test_largest_divisor_follows_the_most_detailed_image():
-    assert knots([NATURAL, NOISE], 6000, 8)[1][0] == pytest.approx(2, rel=2e-3)
-    assert knots([NATURAL], 6000, 3)[1][0] == 3
+    assert compute_knots([NATURAL, NOISE], 6000, 8)[1][0] == pytest.approx(2, rel=2e-3)
+    assert compute_knots([NATURAL], 6000, 3)[1][0] == 3
 
 
 def test_size_is_full_from_the_start_without_detail():
@@ -73,7 +73,7 @@ def test_size_grows_in_integer_steps_to_full():
     assert points[-1][0] <= 3001
     assert all(step > 500 and step % 100 == 1 for step, _ in points[1:])
     assert all(value == int(value) for _, value in points)
-    steps, divisors = knots([Spectrum.from_image(smooth)], 3000, 8)
+    steps, divisors = compute_knots([Spectrum.from_image(smooth)], 3000, 8)
     sizes = settings.to_schedule([smooth])
     for step in (700, 1500, 2300, 2900):  # the floor of the knots' value, linear in the number of pixels
         assert sizes.at(step + 1) == int(np.interp(step, steps, divisors**-2) ** -0.5)

@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from clsplat.conformance.checks.images import make_camera
 from clsplat.conformance.scenes import random_case
-from clsplat.photos.photographs import Photograph, texture_quantile, unmasked_gradient
+from clsplat.photos.photographs import Photograph, compute_texture_quantile, unmasked_gradient
 from clsplat.render.rasterizer import Rasterizer
 from clsplat.render.workspace import Workspace
 from tests.support.devices import on_devices
@@ -62,7 +62,7 @@ def test_masked_pixels_have_no_texture(device, rng, width, height):
         np.testing.assert_allclose(texture[:height, :width], expected, atol=1e-6)
         texture[:height, :width] = 0
         assert (texture == 0).all()
-        results.append(texture_quantile(workspace, [photograph], 0.5))
+        results.append(compute_texture_quantile(workspace, [photograph], 0.5))
     assert results[0] == results[1]
     if known.any():
         assert results[0] == pytest.approx(

@@ -16,7 +16,7 @@ from clsplat.runs.describe import describe
 from clsplat.runs.opening import check_preparation, expect_measures, list_photo_names
 from clsplat.runs.state import RunState
 from clsplat.stages.optimize import Optimize
-from clsplat.sweeps.batch import pending_cell
+from clsplat.sweeps.batch import prepare_cell
 from clsplat.sweeps.cell import Scenes
 from clsplat.sweeps.experiment import Job, run_pipeline
 from clsplat.sweeps.store import Store
@@ -88,7 +88,7 @@ def test_unprepared_photographs_give_the_training_count(photos, sets, training):
 
 
 def as_cell(asked, state, device, start):
-    return pending_cell(Cell("a", asked), Scenes(state.out.parent / "scenes"), Store(state.out.parent))
+    return prepare_cell(Cell("a", asked), Scenes(state.out.parent / "scenes"), Store(state.out.parent))
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pytest
 
 from clsplat.runs.live.live import Live
 from clsplat.runs.live.server import FOLDER as LIVE
-from clsplat.runs.live.server import SCRIPTS, page
+from clsplat.runs.live.server import SCRIPTS, render_page
 from tests.support.browser import CHROMIUM, Browser
 from tests.support.html_page import Page
 from tests.support.live import in_background, trained
@@ -14,7 +14,7 @@ NEWEST = "live.watch.live.newest"
 
 
 def test_page_is_self_contained_and_its_scripts_are_short():
-    text = page().decode()
+    text = render_page().decode()
     assert Page(text).elements["script"] == 1
     assert "default-src 'none'; img-src 'self' data:; connect-src 'self'; style-src 'sha256-" in text
     for name in SCRIPTS:
@@ -35,9 +35,9 @@ def test_late_image_does_not_replace_a_newer_one(tmp_path):
       });
       %s
       Link.prototype.poll = () => {};
-      const link = new Link({wish: () => null, show: ({number}) => shown.push(number)}), pause = () =>
+      const link = new Link({nextRequest: () => null, show: ({number}) => shown.push(number)}), pause = () =>
         new Promise(later => setTimeout(later, 10));
-      const asked = [1, 2].map(number => link.ask({number, key: `view=${number}`, pace: "still"}));
+      const asked = [1, 2].map(number => link.load({number, key: `view=${number}`, pace: "still"}));
       for (const number of [2, 1]) { await pause(); decoded[number](); }
       await Promise.all(asked);
       return [shown, closed];

@@ -106,12 +106,12 @@ def test_page_that_missed_the_end_is_not_counted_as_informed():
         looks = 0
 
         @property
-        def ended(self) -> bool:  # it ends while the answer is made
+        def has_ended(self) -> bool:  # it ends while the answer is made
             self.looks += 1
             return self.looks > 1
 
-        @ended.setter
-        def ended(self, _: bool) -> None: ...
+        @has_ended.setter
+        def has_ended(self, _: bool) -> None: ...
 
     desk = Ending()
     state = json.loads(Handlers(desk)(Request("state.json", {})).body)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from clsplat.core.errors import DataError
-from clsplat.photos.exposure_estimate import exif_exposures
+from clsplat.photos.exposure_estimate import exposures_from_exif
 from clsplat.prepare.gather import gather
 from clsplat.scene.camera import Camera
 from clsplat.scene.images import (
@@ -115,9 +115,9 @@ def test_exposures_file_takes_precedence_over_exif(tmp_path):
 def test_camera_gains_are_light_ratios_to_the_display_power(tmp_path):
     (tmp_path / "a.jpg").write_bytes(with_exposure(iso=100))
     (tmp_path / "b.jpg").write_bytes(with_exposure(iso=400))
-    result = exif_exposures([view(tmp_path, "a.jpg"), view(tmp_path, "b.jpg")])
+    result = exposures_from_exif([view(tmp_path, "a.jpg"), view(tmp_path, "b.jpg")])
     half = np.log(4) / 2.2 / 2
     assert result.log_gains["b.jpg"] == pytest.approx([half] * 3)
     assert result.log_gains["a.jpg"] == pytest.approx([-half] * 3)
     assert result.spread == pytest.approx(half)
-    assert exif_exposures([]).log_gains == {}
+    assert exposures_from_exif([]).log_gains == {}

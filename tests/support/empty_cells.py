@@ -26,7 +26,7 @@ def measure(cells: int, workers: int, folder: Path) -> None:
     slots = [DeviceSlot("local", f"device {number}", "b") for number in range(workers)]
     dask.find_slots = lambda worker, devices, packing: slots
     store, memory, process = Store(folder), [], psutil.Process()
-    engine = dask.engine(Execution(engine="local"), store, None)
+    engine = dask.open_engine(Execution(engine="local"), store, None)
     engine.make_command = lambda device: ["touch", OUT]
     wanted = [PendingCell(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), 1) for i in range(cells)]
     drive = Dispatcher(store, engine, True, CellOptions(store.now()))

@@ -93,7 +93,7 @@ def test_first_of_two_writers_publishes_and_the_second_compares(store, options, 
     code = (
         WRITES.replace("b'bits'", repr(bits)) + f"; import os; os.rename({str(first.path)!r}, {str(folder.result)!r})"
     )
-    first.manifest()
+    first.write_manifest()
     outcome = run_cell(CELL, store, command(code), options)
     assert outcome.state == state
     assert (folder.result / "point_cloud.ply").read_bytes() == b"bits"
@@ -231,7 +231,7 @@ def test_run_that_ignores_its_stop_is_killed(store, options, monkeypatch):
 
 
 def test_removed_attempt_ends_its_run(store, options, monkeypatch):
-    monkeypatch.setattr("clsplat.sweeps.store.BEAT", 0.0)
+    monkeypatch.setattr("clsplat.sweeps.store.BEAT_INTERVAL_S", 0.0)
     removes = "import shutil, sys, time; shutil.rmtree(sys.argv[2]); time.sleep(60)"
     outcome = run_cell(CELL, store, command(removes), options)
     assert outcome.state == "failed"
@@ -239,12 +239,12 @@ def test_removed_attempt_ends_its_run(store, options, monkeypatch):
 
 
 def test_process_frozen_past_its_attempt_uses_the_result(store, options, monkeypatch):
-    monkeypatch.setattr("clsplat.sweeps.store.BEAT", 0.0)
+    monkeypatch.setattr("clsplat.sweeps.store.BEAT_INTERVAL_S", 0.0)
     folder = store.add(CELL)
     other = folder.begin("other", options.since)
     (other.path / "point_cloud.ply").write_bytes(b"bits")
     publishes = f"import os, shutil, sys, time; os.rename({str(other.path)!r}, {str(folder.result)!r})\n"
-    other.manifest()
+    other.write_manifest()
     outcome = run_cell(CELL, store, command(publishes + "shutil.rmtree(sys.argv[2]); time.sleep(60)"), options)
     assert outcome.state == "published"
     assert event_names(store) == ["start", "skip"]
@@ -254,7 +254,7 @@ def test_process_frozen_after_its_run_uses_the_result(store, options, monkeypatc
     folder = store.add(CELL)
     other = folder.begin("other", options.since)
     (other.path / "point_cloud.ply").write_bytes(b"bits")
-    other.manifest()
+    other.write_manifest()
 
     def sleeps(cell, attempt):
         os.rename(other.path, folder.result)

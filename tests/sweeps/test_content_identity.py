@@ -13,7 +13,7 @@ from clsplat.pipeline.input_files import content_hashes, hash_content
 from clsplat.pipeline.loading import load
 from clsplat.stages.video import Video
 from clsplat.sweeps import cell as fingerprint
-from clsplat.sweeps.batch import pending_cell
+from clsplat.sweeps.batch import prepare_cell
 from clsplat.sweeps.cell import CellRun, Scenes
 from clsplat.sweeps.task import run_cell
 from tests.support.cells import CELL, WRITES, command, keys
@@ -81,7 +81,7 @@ def test_camera_path_name_is_not_a_file(tmp_path, monkeypatch):
 
 
 def test_sweep_computes_the_expected_keys(tiny_scene, store, tmp_path):
-    result = pending_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
+    result = prepare_cell(matrix.Cell("x", load("smoke", [f"scene.path={tiny_scene}"])), Scenes(tmp_path), store)
     assert result.in_class("b").key == keys("smoke", tiny_scene, tmp_path)
 
 

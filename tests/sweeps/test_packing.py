@@ -46,7 +46,7 @@ def test_runs_sharing_a_device_get_separate_slots(monkeypatch):
     monkeypatch.setattr(machine, "usable_cores", lambda: (0, 1, 2, 3))
     monkeypatch.setattr(devices, "list_devices", lambda: [CPU])
     monkeypatch.setattr(devices, "choose_device", lambda name: CPU)
-    monkeypatch.setattr(devices, "bits_class", lambda info, infos: "b")
+    monkeypatch.setattr(devices, "find_bits_class", lambda info, infos: "b")
     result = find_slots("local", ["a"], 2)
     assert [slot.cores for slot in result] == [(0, 1), (2, 3)]
     assert len({*result}) == 2

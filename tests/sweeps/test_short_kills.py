@@ -7,7 +7,7 @@ import pytest
 
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Cell
-from clsplat.sweeps.batch import pending_cell
+from clsplat.sweeps.batch import prepare_cell
 from clsplat.sweeps.cell import Scenes
 from clsplat.sweeps.child import FILE, OUT, PYTHON
 from clsplat.sweeps.store import Store
@@ -37,7 +37,7 @@ main()
 def test_killed_run_resumes_to_the_same_bits(tiny_scene: Path, few_steps: Path, store: Store, options: CellOptions):
     """CLSPLAT_KILLS=20 kills workers, runs, drivers and schedulers, over six cells."""
     checked = load("smoke", [f"scene.path='{tiny_scene}'", *FEW])
-    cell = pending_cell(Cell("few", checked), Scenes(store.prepared), store).in_class("b")
+    cell = prepare_cell(Cell("few", checked), Scenes(store.prepared), store).in_class("b")
     outcome = run_cell(cell, store, [PYTHON, "-c", RUN, FILE, OUT], options)
     assert outcome.state == "published", outcome.message
     ends = [event["exit_code"] for event in store.events() if event["event"] == "end"]

@@ -305,9 +305,9 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Tls:
 def test_unusable_certificates_are_named(authority, changed, words):
     library = pytest.importorskip("clsplat.sweeps.dask")
     folder = Path(authority.ca).parent
-    assert library.security(authority).require_encryption
+    assert library.make_security(authority).require_encryption
     with pytest.raises(ConfigError, match=words):
-        library.security(authority.model_copy(update={key: str(folder / name) for key, name in changed.items()}))
+        library.make_security(authority.model_copy(update={key: str(folder / name) for key, name in changed.items()}))
 
 
 def test_worker_checks_certificates_before_it_checks_a_device(authority, monkeypatch):

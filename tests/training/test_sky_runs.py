@@ -16,7 +16,7 @@ from clsplat.core.reading import sha256
 from clsplat.gaussians.conversion import convert, with_sky_splats
 from clsplat.gaussians.sky import Sky, read_sky_file, sample_texels, texel_directions, write_sky_file
 from clsplat.metrics.images import psnr
-from clsplat.photos.sky_detection import SkyEvidence, detect_sky, panorama
+from clsplat.photos.sky_detection import SkyEvidence, build_sky_map, detect_sky
 from clsplat.pipeline.loading import load, without_auto
 from clsplat.render.backdrops import Auto
 from clsplat.runs.state import RunState
@@ -177,7 +177,7 @@ def test_directions_without_visible_sky_are_left_to_gaussians(yard):
     _, folder = yard
     scene = clsplat.read_scene(folder)
     photographs = [(view, np.rint(255 * view.photograph()).astype(np.uint8), None) for view in scene.views]
-    texels, free = panorama(list(detect_sky(scene, photographs)), 32)
+    texels, free = build_sky_map(list(detect_sky(scene, photographs)), 32)
     directions = texel_directions(32)
     looked = np.abs(directions[:, 1]) < 0.4
     assert not free[looked & (directions[:, 1] > 0.35)].any()

@@ -70,8 +70,8 @@ def test_static_model_has_no_motion_and_no_slider(tmp_path):
     model = cloud(60)
     assert "motion" not in pack(model).header
     still, runs = page_of(tmp_path, model).text(), page_of(tmp_path, moving(model)).text()
-    assert ['id="moment"' in text for text in (still, runs)] == [False, True]
-    assert '"moments":[0.0,0.35,0.6,1.0]' in runs.replace(", ", ",").replace(": ", ":")
+    assert ['id="timestamp"' in text for text in (still, runs)] == [False, True]
+    assert '"timestamps":[0.0,0.35,0.6,1.0]' in runs.replace(", ", ",").replace(": ", ":")
 
 
 @pytest.mark.slow
@@ -86,14 +86,14 @@ def test_browser_draws_each_photograph_at_its_time(tmp_path):
         for i, (view, moment) in enumerate(zip(scene(tmp_path).views[:2], MOMENTS, strict=False)):
             browser.run(f"viewer.photographs.choose({i}, 0)")
             browser.rest()
-            assert browser.run("viewer.moment") == moment
+            assert browser.run("viewer.timestamp") == moment
             width, height, text = browser.run(PIXELS)
             drawn = np.frombuffer(b64decode(text), np.uint8).reshape(height, width, 4)[..., :3]
             known = to_8_bits(renderer.render(replace(view, time=moment)).image)
             assert psnr(drawn, known) > 45
         browser.key(".")
-        assert browser.run("[viewer.moment, viewer.photographs.chosen]") == [0.6, -1], "away from it"
-        skips = [browser.key(key) or browser.run("viewer.moment") for key in "..,,,,"]
+        assert browser.run("[viewer.timestamp, viewer.photographs.chosen]") == [0.6, -1], "away from it"
+        skips = [browser.key(key) or browser.run("viewer.timestamp") for key in "..,,,,"]
         assert skips == [1.0, 1.0, 0.6, 0.35, 0.0, 0.0], "from one moment of the photos to the next"
         assert "was taken at another time" in browser.run("document.getElementById('caption').textContent")
         browser.run("viewer.clock.to(0.25)")
@@ -101,10 +101,10 @@ def test_browser_draws_each_photograph_at_its_time(tmp_path):
         address = browser.run("location.hash")
         assert address.endswith(";0.25")
         browser.run(f"location.hash = {address.replace(';0.25', ';0.5')!r}")
-        assert browser.run("new Promise(done => setTimeout(() => done(viewer.moment), 100))") == 0.5
+        assert browser.run("new Promise(done => setTimeout(() => done(viewer.timestamp), 100))") == 0.5
         browser.run("viewer.clock.to(0)")
         pivot = browser.run(NEAREST)
-        then = model.at(browser.run("viewer.moment")).means
+        then = model.at(browser.run("viewer.timestamp")).means
         assert np.linalg.norm(then - pivot, axis=1).min() < 2e-3, "a double click finds a splat where it is then"
         browser.key(" ")
         assert browser.run("viewer.clock.playing") is True

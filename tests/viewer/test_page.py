@@ -15,7 +15,7 @@ from clsplat.core.page import downscale, inline
 from clsplat.scene.viewpoint import Viewpoint
 from clsplat.viewer import page as module
 from clsplat.viewer.packing import pack
-from clsplat.viewer.page import FOLDER, SCRIPTS, Page, camera_data, omitted_indices, script, view_entries
+from clsplat.viewer.page import FOLDER, SCRIPTS, Page, camera_data, omitted_indices, read_script, view_entries
 from tests.support.html_page import HOSTILE
 from tests.support.html_page import Page as Parsed
 from tests.support.viewer_pages import cloud, scene, views
@@ -91,7 +91,7 @@ def test_scripts_are_short_and_part_of_the_page():
         lines = path.read_text().splitlines()
         if len(lines) > 250 or max(map(len, lines)) > 120:
             faults.append(f"{path.name}: {len(lines)} lines of up to {max(map(len, lines))} columns")
-        if path.stem not in (*SCRIPTS, "viewer") or (path.suffix != ".css" and path.read_text() not in script()):
+        if path.stem not in (*SCRIPTS, "viewer") or (path.suffix != ".css" and path.read_text() not in read_script()):
             faults.append(f"{path.name}: is no part of the page")
     assert not faults, "\n".join(faults)
 

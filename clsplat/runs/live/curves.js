@@ -1,7 +1,7 @@
 // The reports of the run as three small curves.
 
 const LOSS = 1, PSNR = 2, COUNT = 3; // indices in a point, after its step
-const short = value => value >= 1e6 ? `${(value / 1e6).toFixed(2)} M` : thousands(value);
+const short = value => value >= 1e6 ? `${(value / 1e6).toFixed(2)} M` : formatCount(value);
 const SHOWN = {loss: [LOSS, v => v.toPrecision(3)], psnr: [PSNR, v => v.toFixed(1)], gaussians: [COUNT, short]};
 
 class Curves {

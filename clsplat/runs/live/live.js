@@ -1,8 +1,8 @@
 // The page: the newest image, moved along with the camera until the next one arrives.
 
-const MOVING = 250; // ms since the last change of the camera
+const MOVING_MS = 250; // ms since the last change of the camera
 
-class Live extends Walk {
+class Live extends PageCamera {
   constructor(info, curves) {
     super(info, find("canvas"));
     Object.assign(this, {curves, state: {}, newest: null});
@@ -12,11 +12,11 @@ class Live extends Walk {
     this.controls = new Controls(this, this.canvas);
     this.photographs.compare("off");
     new ResizeObserver(() => { this.photographs.place(); this.change(); }).observe(this.stage);
-    addEventListener("hashchange", () => this.adopt());
+    addEventListener("hashchange", () => this.readAddress());
     find("strip").addEventListener("error", ({target}) => { // the thumbnail was not read in time
       if (target.src && !target.src.endsWith("&")) setTimeout(() => { target.src += "&"; }, 5000);
     }, true);
-    if (!this.adopt() && info.first >= 0) this.photographs.choose(info.first, 0);
+    if (!this.readAddress() && info.first >= 0) this.photographs.choose(info.first, 0);
     this.change();
   }
 
@@ -39,16 +39,16 @@ class Live extends Walk {
   }
 
   // The camera of the next image: that of a view, or that of the stage.  pace: as in preview.py.
-  wish() {
+  nextRequest() {
     if (!this.state.drawn || this.state.ended) return null;
     const {width, height} = this.pane(), exact = this.at >= 0;
     if (width < 8 || height < 8) return null;
-    const {intrinsics} = framed(this.camera, width, height, false), lens = [...intrinsics, width, height];
+    const {intrinsics} = makeFrame(this.camera, width, height, false), lens = [...intrinsics, width, height];
     const camera = exact ? this.camera : {...this.camera, lens};
-    if (exact) this.moment = this.info.views[this.at].time;
-    const then = this.moment === undefined ? "" : `&time=${this.moment}`; // of the last chosen photograph
-    const key = exact ? `view=${this.at}` : `camera=${written(camera)}${then}`, same = this.newest?.key === key;
-    const moving = performance.now() - this.changed < MOVING || this.controls.pointers.size > 0 && !same;
+    if (exact) this.timestamp = this.info.views[this.at].time;
+    const then = this.timestamp === undefined ? "" : `&time=${this.timestamp}`; // of the last chosen photograph
+    const key = exact ? `view=${this.at}` : `camera=${formatCamera(camera)}${then}`, same = this.newest?.key === key;
+    const moving = performance.now() - this.changed < MOVING_MS || this.controls.pointers.size > 0 && !same;
     if (moving) return same ? null : {key, camera, pace: "moving"};
     if (!same || this.newest.pace === "moving") return {key, camera, pace: "still"};
     return this.newest.step !== this.state.drawn ? {key, camera, pace: "again"} : null;
@@ -62,43 +62,44 @@ class Live extends Walk {
   }
 
   draw() {
-    const ratio = Math.min(2, devicePixelRatio || 1), {width, height} = this.pane(), pen = this.canvas.getContext("2d");
+    const context = this.canvas.getContext("2d");
+    const ratio = Math.min(2, devicePixelRatio || 1), {width, height} = this.pane();
     const [wide, high] = [width, height].map(side => Math.max(1, Math.round(side * ratio)));
     if (this.canvas.width !== wide) this.canvas.width = wide;
     if (this.canvas.height !== high) this.canvas.height = high;
-    const frame = framed(this.camera, width, height, false);
-    pen.setTransform(1, 0, 0, 1, 0, 0);
-    pen.fillRect(0, 0, wide, high);
-    if (this.newest) this.paint(pen, frame, ratio);
+    const frame = makeFrame(this.camera, width, height, false);
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.fillRect(0, 0, wide, high);
+    if (this.newest) this.paint(context, frame, ratio);
     this.frustums.draw(frame, [[0, 0]], ratio);
     if (this.newest) this.describe();
   }
 
   // Move the image to where its plane at the distance of the pivot is visible from the current camera.
-  paint(pen, frame, ratio) {
+  paint(context, frame, ratio) {
     const {bitmap, camera} = this.newest, [fx, fy, cx, cy, width, height] = camera.lens;
     const depth = Math.max(0.05 * this.radius, dot(axis(camera, 2), add(this.pivot, camera.eye, -1)));
     const corners = [[0, 0], [width, 0], [0, height]].map(([x, y]) => {
       const across = add(scaled(axis(camera, 0), (x - cx) / fx), axis(camera, 1), (y - cy) / fy);
-      return projected(frame, add(camera.eye, add(across, axis(camera, 2)), depth));
+      return projectPoint(frame, add(camera.eye, add(across, axis(camera, 2)), depth));
     });
     if (!corners.every(Boolean)) return;
     const [origin, right, below] = corners, {width: columns, height: rows} = bitmap;
     const [u, v] = [scaled(add(right, origin, -1), 1 / columns), scaled(add(below, origin, -1), 1 / rows)];
-    pen.setTransform(...scaled([...u, ...v, ...origin], ratio));
-    pen.imageSmoothingQuality = "high";
-    pen.drawImage(bitmap, 0, 0);
+    context.setTransform(...scaled([...u, ...v, ...origin], ratio));
+    context.imageSmoothingQuality = "high";
+    context.drawImage(bitmap, 0, 0);
   }
 
   describe() {
-    const {bitmap, step, pace} = this.newest, still = pace !== "moving" && !this.wish();
-    find("statistics").textContent = `step ${thousands(step)} · ${bitmap.width} × ${bitmap.height} px`;
-    if (!still && this.wish()?.pace !== "again") return;
-    this.remember();
+    const {bitmap, step, pace} = this.newest, still = pace !== "moving" && !this.nextRequest();
+    find("statistics").textContent = `step ${formatCount(step)} · ${bitmap.width} × ${bitmap.height} px`;
+    if (!still && this.nextRequest()?.pace !== "again") return;
+    this.storeInAddress();
     document.documentElement.dataset.ready = "1";
   }
 
-  pause() { if (!find("pause").disabled) link.press(!this.state.paused); }
+  pause() { if (!find("pause").disabled) link.setPaused(!this.state.paused); }
 
   focus() {} // an image has no depths
 
@@ -124,22 +125,22 @@ class Watch {
     find("tunnel").textContent = `ssh -L ${port}:127.0.0.1:${port} HOST`;
   }
 
-  wish() { return this.live?.wish(); }
+  nextRequest() { return this.live?.nextRequest(); }
   show(picture) { this.live.show(picture); }
 
   async take(state) {
     if (state.scene !== this.scene) await this.enter(state.scene);
     this.curves.add((state.points ?? []).filter(([step]) => step > this.curves.last));
     if (this.live) this.live.state = state;
-    find("state").textContent = this.text(state);
+    find("state").textContent = this.stateText(state);
     find("bar").value = state.steps ? Math.min(1, state.step / state.steps) : 0;
     find("pause").disabled = !state.drawn || state.ended;
     find("pause").hidden = state.ended;
     find("pause").textContent = state.paused ? "Resume" : "Pause";
     find("pause").classList.toggle("paused", state.paused);
     if (state.host) find("tunnel").textContent = find("tunnel").textContent.replace(/\S+$/, state.host);
-    if (!this.live?.newest) find("message").textContent = state.ended ? this.end(state) : this.text(state);
-    this.notice(state.ended ? this.end(state) : state.fault);
+    if (!this.live?.newest) find("message").textContent = state.ended ? this.endText(state) : this.stateText(state);
+    this.showNotice(state.ended ? this.endText(state) : state.fault);
     this.live?.schedule();
   }
 
@@ -152,37 +153,37 @@ class Watch {
     this.live = new Live(info, this.curves);
   }
 
-  text({state, stage, progress, step, steps, seconds_left: left, paused, ended}) {
+  stateText({state, stage, progress, step, steps, seconds_left: left, paused, ended}) {
     if (!state) return ended ? "ended" : "Waiting for the run …";
     const end = {done: "finished", failed: "failed", interrupted: "interrupted"}[state] ?? (ended && "ended");
     const doing = paused ? "paused" : stage && stage !== "optimize" ? stage.replaceAll("_", " ") : state;
     const parts = [end || doing];
     if (!end && progress && progress.unit !== "steps") {
-      parts.push(`${thousands(progress.done)} of ${thousands(progress.total)} ${progress.unit}`);
+      parts.push(`${formatCount(progress.done)} of ${formatCount(progress.total)} ${progress.unit}`);
     }
-    if (step && steps) parts.push(`step ${thousands(step)} of ${thousands(steps)}`);
-    if (left && !paused && ["preparing", "running"].includes(state)) parts.push(`${clock(left)} left`);
+    if (step && steps) parts.push(`step ${formatCount(step)} of ${formatCount(steps)}`);
+    if (left && !paused && ["preparing", "running"].includes(state)) parts.push(`${formatDuration(left)} left`);
     return parts.join(" · ");
   }
 
-  end({state, message}) {
+  endText({state, message}) {
     const how = {done: "The run is done", failed: "The run has failed", interrupted: "The run was interrupted"}[state];
     const folder = "; its folder contains viewer.html and report.html";
     return `${how ?? "The run has ended"}${message ? `: ${message}` : folder}.`;
   }
 
-  lost() {
+  showLost() {
     find("pause").disabled = true;
-    if (!this.live?.state.ended) this.notice("The run cannot be reached: it has ended, or the tunnel is closed.");
+    if (!this.live?.state.ended) this.showNotice("The run cannot be reached: it has ended, or the tunnel is closed.");
   }
 
-  notice(text) {
+  showNotice(text) {
     find("notice").hidden = !text;
     if (text) find("notice").textContent = text;
   }
 }
 
-function clock(seconds) {
+function formatDuration(seconds) {
   const whole = Math.round(seconds), two = number => String(number).padStart(2, "0");
   const [hours, minutes] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60];
   return hours ? `${hours}:${two(minutes)}:${two(whole % 60)}` : `${minutes}:${two(whole % 60)}`;

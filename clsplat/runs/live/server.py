@@ -25,7 +25,7 @@ from clsplat.runs.live.preview import Credit, Kind, LiveRun, LiveState, Pace, Pr
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 from clsplat.scene.viewpoint import Viewpoint
-from clsplat.viewer.page import camera_data, join_scripts, style, viewpoint_data
+from clsplat.viewer.page import camera_data, join_scripts, read_style, viewpoint_data
 
 # Requests: only GET, with a host name of this machine, and a secret in the path.
 
@@ -118,7 +118,7 @@ class Server(socketserver.ThreadingTCPServer):
 
     def __init__(self, port: int, token: str, handle: Callable[[Request], Response]) -> None:
         """port: 0 selects the first free port from PORT on.  Raises ConfigError if no port can be used."""
-        self.token, self.handle, self.ended, self._rate = token, handle, False, Credit(RATE, BURST)
+        self.token, self.handle, self.has_ended, self._rate = token, handle, False, Credit(RATE, BURST)
         self._rate.spend(-BURST)
         for self.port in [port] if port else range(PORT, PORT + PORTS):
             try:
@@ -136,7 +136,7 @@ class Server(socketserver.ThreadingTCPServer):
 
     def stop(self) -> None:
         """Stop the server; open connections are closed after their current response."""
-        self.ended = True
+        self.has_ended = True
         self.shutdown()
         self.server_close()
 
@@ -160,14 +160,14 @@ class _Connection(BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
 
     def do_GET(self) -> None:
-        if not self.server.ended:
+        if not self.server.has_ended:
             self.server.throttle()
             try:
                 response = self.server.handle(parse_request(self.path, self.headers.get("Host", ""), self.server.token))
             except RequestError as error:
                 response = error.response
             self._send(response)
-        self.close_connection |= self.server.ended
+        self.close_connection |= self.server.has_ended
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         self.close_connection = True  # the unread data may be a body
@@ -193,12 +193,12 @@ VIEWER_SCRIPTS = ("camera", "motion", "controls", "photographs", "frustums", "pa
 SCRIPTS = ("curves", "link", "live")
 
 
-def page() -> bytes:
+def render_page() -> bytes:
     """Return the HTML of the page, which requests its data from the server."""
     scripts = [(FOLDER / f"{name}.js").read_text("utf-8") for name in SCRIPTS]
     text = render(
         "live.html.j2",
-        style=inline(style() + (FOLDER / "live.css").read_text("utf-8")),
+        style=inline(read_style() + (FOLDER / "live.css").read_text("utf-8")),
         script=inline(join_scripts(VIEWER_SCRIPTS, scripts)),
     )
     return text.encode()
@@ -231,7 +231,7 @@ class Handlers:
 
     def __init__(self, live: LiveState) -> None:
         self.live = live
-        self._page = page()
+        self._page = render_page()
         self._routes: dict[str, Callable[[Request], Response]] = {
             "": lambda request: Response(200, self._page, "text/html; charset=utf-8"),
             "state.json": self._state,

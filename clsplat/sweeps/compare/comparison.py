@@ -131,7 +131,7 @@ class RunComparison:
         """
         if not paths:
             raise ConfigError("no runs to compare; pass at least one run folder")
-        runs = [RunFolder.read(folder) for path in paths for folder in _cells(path)]
+        runs = [RunFolder.read(folder) for path in paths for folder in _finished_cell_folders(path)]
         resolved_paths: set[Path] = set()
         for run in runs:
             if run.path.resolve() in resolved_paths:
@@ -173,7 +173,7 @@ class RunComparison:
                 yield VariantRow(variant, sorted(variant_runs, key=lambda run: run.metrics.seed))
 
 
-def _cells(path: Path) -> list[Path]:
+def _finished_cell_folders(path: Path) -> list[Path]:
     """Return the folders of the finished cells of a matrix folder; for another folder, the folder itself."""
     if not (path / PIPELINE).is_file() or "matrix" not in read_settings(path):
         return [path]

@@ -79,7 +79,7 @@ def main_table(rows: Sequence[VariantRow]) -> MetricTable:
     cost_columns = [
         *_cost(rows, "Gaussians", lambda metrics: metrics.gaussians),
         *_cost(rows, "parameters", lambda metrics: metrics.parameters),
-        Column("steps", _cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
+        Column("steps", _to_table_cells([[run.metrics.steps for run in row.runs] for row in rows], 0)),
         Column("training", [TableCell(duration_text(_train_seconds(row))) for row in rows]),
         *_cost(rows, "CPU seconds", lambda metrics: metrics.cpu_seconds),
         *_cost(rows, "device memory, MB", lambda metrics: metrics.device_memory and metrics.device_memory / 1e6),
@@ -95,7 +95,7 @@ def _cost(rows: Sequence[VariantRow], heading: str, cost: Callable[[RunMetrics],
     """Return the column of a cost as a list, which is empty if no run recorded the cost."""
     optional_values = [[cost(run.metrics) for run in row.runs] for row in rows]
     values = [[value for value in row if value is not None] for row in optional_values]
-    return [Column(heading, _cells(values, 0))] if any(values) else []
+    return [Column(heading, _to_table_cells(values, 0))] if any(values) else []
 
 
 def other_tables(rows: Sequence[VariantRow]) -> list[MetricTable]:
@@ -127,7 +127,7 @@ def means_over_scenes(comparison: RunComparison) -> MetricTable | None:
             [fmean(values) for row in rows if (values := row.values("test", row.downscale, name))] for rows in groups
         ]
         if means and all(len(values) == len(scenes) for values in means):
-            columns.append(Column(heading, _cells([[fmean(values)] for values in means], digits, choose_best)))
+            columns.append(Column(heading, _to_table_cells([[fmean(values)] for values in means], digits, choose_best)))
     return MetricTable([rows[0].variant for rows in groups], [Group("", columns)]) if columns else None
 
 
@@ -166,7 +166,7 @@ def _training_size(rows: Sequence[VariantRow]) -> list[Group]:
 
 def _group(rows: Sequence[VariantRow], split: str, downscale: str) -> Group:
     columns = [
-        Column(heading, _cells([row.values(split, downscale, name) for row in rows], digits, choose_best))
+        Column(heading, _to_table_cells([row.values(split, downscale, name) for row in rows], digits, choose_best))
         for name, (heading, digits, choose_best) in METRICS.items()
         if any(row.values(split, downscale, name) for row in rows)
     ]
@@ -187,7 +187,9 @@ def _seeds(row: VariantRow) -> str:
     return ", ".join(seeds) if len(seeds) <= MAX_SEEDS else f"{len(seeds)} seeds"
 
 
-def _cells(values: Sequence[list[float]], digits: int, choose: Callable[..., float] | None = None) -> list[TableCell]:
+def _to_table_cells(
+    values: Sequence[list[float]], digits: int, choose: Callable[..., float] | None = None
+) -> list[TableCell]:
     """Return a cell with the mean of each list of values.  The best of the rounded means is marked.
 
     digits: number of decimals.  choose: returns the best of several means; None: mark no cell.
@@ -195,10 +197,10 @@ def _cells(values: Sequence[list[float]], digits: int, choose: Callable[..., flo
     means = [round(fmean(row), digits) if row else None for row in values]
     available_means = [mean for mean in means if mean is not None]
     best_mean = choose(available_means) if choose and len(available_means) > 1 else None
-    return [_cell(row, mean, digits, mean == best_mean) for row, mean in zip(values, means, strict=True)]
+    return [_to_table_cell(row, mean, digits, mean == best_mean) for row, mean in zip(values, means, strict=True)]
 
 
-def _cell(values: list[float], mean: float | None, digits: int, is_best: bool) -> TableCell:
+def _to_table_cell(values: list[float], mean: float | None, digits: int, is_best: bool) -> TableCell:
     if mean is None:
         return TableCell("–")
     deviation = stdev(values) if len(values) > 1 else 0.0
@@ -210,7 +212,7 @@ def _cell(values: list[float], mean: float | None, digits: int, is_best: bool) -
 MAX_LINES = len(COLORS)  # of a chart; if there are more runs, each line is the mean of a variant
 
 
-def curves(rows: Sequence[VariantRow]) -> list[Markup]:
+def draw_curves(rows: Sequence[VariantRow]) -> list[Markup]:
     """Draw charts of PSNR and the number of Gaussians during training, and of metrics over image sizes, as SVG.
 
     Charts of the training have a line per run, or per variant if there are more than MAX_LINES runs.
@@ -338,11 +340,11 @@ def comparison_page(
         variants=variants,
         published=published,
         settings=differing_settings(variants),
-        runs=[(comparison.variant(run), str(run.path), run.metrics.seed, _links(run, folder)) for run in runs],
+        runs=[(comparison.variant(run), str(run.path), run.metrics.seed, _make_links(run, folder)) for run in runs],
     )
 
 
-def _links(run: RunFolder, folder: Path) -> dict[str, str]:
+def _make_links(run: RunFolder, folder: Path) -> dict[str, str]:
     """Return the links to the report and the viewer page of a run, relative to a folder."""
     files = {stage: run.path / run.metrics.files.get(stage, "") for stage in ("report", "viewer")}
     return {
@@ -354,7 +356,7 @@ def _links(run: RunFolder, folder: Path) -> dict[str, str]:
 
 def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
     """Return the values of the template for the section of a scene."""
-    crops, no_crops = _crops(rows)
+    crops, no_crops = _find_page_crops(rows)
     has_several_seeds = any(len(row.runs) > 1 for row in rows)
     explanations = ["mean ± standard deviation over seeds"] if has_several_seeds else []
     return dict(
@@ -365,7 +367,7 @@ def _section(name: str, rows: Sequence[VariantRow]) -> dict[str, Any]:
         remarks=list(differing_conditions(rows)),
         main=main_table(rows),
         others=other_tables(rows),
-        curves=curves(rows),
+        curves=draw_curves(rows),
         crops=[_crop_values(crop) for crop in crops],
         no_crops=no_crops,
     )
@@ -379,7 +381,7 @@ def _sizes(scene: SceneSettings) -> list[str]:
     return [f"sizes are relative to the original photos; trained at {', '.join([first, *others])}"]
 
 
-def _crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
+def _find_page_crops(rows: Sequence[VariantRow]) -> tuple[list[ImageCrop], str]:
     """Return the crops of the first run of each row, and the reason if there are none, else ""."""
     runs = [row.runs[0] for row in rows]
     settings = runs[0].scene

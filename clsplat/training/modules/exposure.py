@@ -27,7 +27,13 @@ from clsplat.losses.base import LossValue
 from clsplat.metrics.views import Gains
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.appearance import IDENTITY, LUMINANCE, MEANING, Floats, ViewTable
-from clsplat.photos.exposure_estimate import UNKNOWN, Exposures, complete_exposures, exif_exposures, measure_exposures
+from clsplat.photos.exposure_estimate import (
+    UNKNOWN,
+    Exposures,
+    complete_exposures,
+    exposures_from_exif,
+    measure_exposures,
+)
 from clsplat.photos.photographs import Mask
 from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
@@ -380,7 +386,7 @@ def estimate_exposures(run: Run) -> Exposures:
         progress = run.status.counted(views, "photos", len(views))
         exposures = measure_exposures(run.scene.tracks, progress, read) if run.scene.tracks else UNKNOWN
         is_complete = len(exposures.log_gains) == len(set(names))
-        run.cache[key] = exposures if is_complete else complete_exposures(exposures, exif_exposures(views))
+        run.cache[key] = exposures if is_complete else complete_exposures(exposures, exposures_from_exif(views))
     result: Exposures = run.cache[key]
     return result
 

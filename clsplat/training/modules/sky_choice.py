@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError
 from clsplat.gaussians.model import Model
 from clsplat.gaussians.sky import Sky
-from clsplat.photos.sky_detection import SkyEvidence, detect_sky, panorama
+from clsplat.photos.sky_detection import SkyEvidence, build_sky_map, detect_sky
 from clsplat.render.backdrops import Auto
 from clsplat.render.filters import ModelSettings
 from clsplat.scene.quality import is_transparent
@@ -102,7 +102,7 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
     If no photograph shows a sky, all texels are learned, starting from the mean color of the photographs' upper thirds.
     """
     evidence = _detect_skies(run, run.scene)
-    if texels := panorama(evidence, side):
+    if texels := build_sky_map(evidence, side):
         return texels
     upper_colors = [photo.upper_pixels.mean(axis=0) / 255 for photo in evidence if len(photo.upper_pixels)]
     if not upper_colors:

@@ -70,20 +70,20 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
     if (camera_type := data.get("camera_type", "perspective")) != "perspective":
         raise DataError(f"{path}: camera_type is {quote(camera_type)}; expected perspective; export the path again")
-    size, fps = _size_and_rate(JsonFrame(path.parent, str(path), data))
-    to_scene = _world_transform(path, scene)
+    size, fps = _read_size_and_rate(JsonFrame(path.parent, str(path), data))
+    to_scene = _make_world_transform(path, scene)
     views = []
     for i, entry in enumerate(frames):
         frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", entry)
         fov = frame.number("fov")
         if fov is None or not 0.01 <= fov < 179:
             raise DataError(f"{frame.source}: fov is {quote(fov)}; expected degrees from 0.01 to 179")
-        matrix = {"transform_matrix": _rows(entry.get("camera_to_world"))}
+        matrix = {"transform_matrix": _to_rows(entry.get("camera_to_world"))}
         pose = np.linalg.inv(read_pose(JsonFrame(path.parent, frame.source, matrix)))[:3]
         time = frame.number("render_time")
         if time is not None and not is_timestamp(time):
             raise DataError(f"{frame.source}: render_time is {time:g}; expected 0 to 1; export the path again")
-        views.append(View(f"frame_{i + 1:05d}", _camera(size, math.radians(fov)), to_scene(pose), time=time))
+        views.append(View(f"frame_{i + 1:05d}", _make_camera(size, math.radians(fov)), to_scene(pose), time=time))
     return CameraPath(views, fps, size)
 
 
@@ -133,13 +133,13 @@ def resample(views: Sequence[View], frames: int) -> list[View]:
     ]
 
 
-def _camera(size: Size, fov: float) -> Camera:
+def _make_camera(size: Size, fov: float) -> Camera:
     """Return a camera with this image size and vertical field of view, rad."""
     focal = size[1] / 2 / math.tan(fov / 2)
     return Camera(*size, focal, focal, size[0] / 2, size[1] / 2)
 
 
-def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
+def _read_size_and_rate(document: JsonFrame) -> tuple[Size, float]:
     """Return the frame size, rounded down to even sides, and the frames per second, or defaults if they are missing."""
     sides, fps = [document.number(key) for key in ("render_width", "render_height")], document.number("fps")
     width, height = (1280, 720) if sides == [None, None] else (int(side or 0) // 2 * 2 for side in sides)
@@ -149,14 +149,14 @@ def _size_and_rate(document: JsonFrame) -> tuple[Size, float]:
         raise DataError(f"{document.source}: {error}; export the path again") from error
 
 
-def _rows(values: Any) -> Any:
+def _to_rows(values: Any) -> Any:
     """Reshape 16 values to four rows.  Any other value is returned unchanged, and the caller rejects it."""
     if not isinstance(values, list) or len(values) != 16:
         return values
     return [values[i : i + 4] for i in range(0, 16, 4)]
 
 
-def _world_transform(path: Path, scene: Path | None) -> Any:
+def _make_world_transform(path: Path, scene: Path | None) -> Any:
     """Return a function that transforms world-to-camera poses, [3, 4], to the coordinates of the scene."""
     file = path.parent / WORLD
     if not file.is_file():
@@ -165,9 +165,9 @@ def _world_transform(path: Path, scene: Path | None) -> Any:
             *(path, WORLD),
         )
         return lambda pose: pose
-    matrix, scale = _affine(file)
+    matrix, scale = _read_affine(file)
     rotation, translation = matrix[:, :3], matrix[:, 3]
-    applied_transform = _applied_transform(scene)
+    applied_transform = _read_applied_transform(scene)
 
     @np.errstate(all="ignore")  # poses that are not finite are rejected later
     def to_scene(pose: Floats) -> Floats:
@@ -180,17 +180,17 @@ def _world_transform(path: Path, scene: Path | None) -> Any:
     return to_scene
 
 
-def _affine(file: Path) -> tuple[Floats, float]:
+def _read_affine(file: Path) -> tuple[Floats, float]:
     """Read the rotation and translation, [3, 4], and the scale from a WORLD file.  Raises DataError."""
     data = read_json(file, "a rotation and a scale in JSON", limit=MAX_BYTES)
     frame = JsonFrame(file.parent, str(file), data if isinstance(data, dict) else {})
-    matrix, scale = _rigid(frame, "transform"), frame.number("scale")
+    matrix, scale = _read_rigid(frame, "transform"), frame.number("scale")
     if scale is None or not scale > 0:
         raise DataError(f"{file}: scale is {quote(scale)}; expected a number above 0; export the file again")
     return matrix, scale
 
 
-def _rigid(frame: JsonFrame, key: str) -> Floats:
+def _read_rigid(frame: JsonFrame, key: str) -> Floats:
     """Read a rotation and a translation, [3, 4].  Raises DataError."""
     try:
         matrix = np.array(frame.value(key), np.float64)[:3]
@@ -201,11 +201,11 @@ def _rigid(frame: JsonFrame, key: str) -> Floats:
     return matrix
 
 
-def _applied_transform(scene: Path | None) -> Floats:
+def _read_applied_transform(scene: Path | None) -> Floats:
     """Return the transform, [3, 4], that nerfstudio applied to poses in transforms.json; by default the identity."""
     file = scene / TRANSFORMS if scene else None
     if file is None or not file.is_file():
         return np.eye(3, 4)
     data = read_json(file, "cameras in JSON", limit=MAX_BYTES)
     frame = JsonFrame(file.parent, str(file), data if isinstance(data, dict) else {})
-    return np.eye(3, 4) if frame.value("applied_transform") is None else _rigid(frame, "applied_transform")
+    return np.eye(3, 4) if frame.value("applied_transform") is None else _read_rigid(frame, "applied_transform")

@@ -142,7 +142,7 @@ def count_frames(path: Path) -> int:
 
 
 @contextmanager
-def _webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
+def _open_webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
     with _without_codec_message():
         writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*CODEC), float(fps), size)
     try:
@@ -161,7 +161,7 @@ def _webm(path: Path, size: Size, fps: float) -> Iterator[Write]:
 
 
 @contextmanager
-def _mp4(path: Path, size: Size, fps: float) -> Iterator[Write]:
+def _open_mp4(path: Path, size: Size, fps: float) -> Iterator[Write]:
     av = _require_av()
     try:
         with av.open(str(path), "w", format="mp4", options={"movflags": "+faststart"}) as container:
@@ -185,7 +185,10 @@ def _mp4(path: Path, size: Size, fps: float) -> Iterator[Write]:
         raise OSError(error.errno, error.strerror) from error
 
 
-WRITERS: dict[str, Callable[[Path, Size, float], AbstractContextManager[Write]]] = {".webm": _webm, ".mp4": _mp4}
+WRITERS: dict[str, Callable[[Path, Size, float], AbstractContextManager[Write]]] = {
+    ".webm": _open_webm,
+    ".mp4": _open_mp4,
+}
 
 
 def _require_av() -> ModuleType:

@@ -105,8 +105,8 @@ def depth_normals(depth: NDArray[np.float32], view: View) -> NDArray[np.float32]
     padded = np.pad(points, ((1, 1), (1, 1), (0, 0)))
     normals = np.cross(padded[2:, 1:-1] - padded[:-2, 1:-1], padded[1:-1, 2:] - padded[1:-1, :-2])
     length = np.linalg.norm(normals, axis=2, keepdims=True)
-    unit = np.divide(normals, length, out=np.zeros_like(normals), where=is_valid[:, :, None] & (length > 0))
-    return np.asarray(unit @ view.world_to_camera[:, :3], np.float32)
+    unit_normals = np.divide(normals, length, out=np.zeros_like(normals), where=is_valid[:, :, None] & (length > 0))
+    return np.asarray(unit_normals @ view.world_to_camera[:, :3], np.float32)
 
 
 def depth_image(depth: NDArray[np.float32], alpha: NDArray[np.float32], depths: tuple[float, float]) -> Image:

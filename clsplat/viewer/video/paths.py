@@ -125,7 +125,7 @@ def normalize(vectors: Floats) -> Floats:
 Indices = NDArray[np.intp]
 DEGREE = 5  # of the B-spline
 SMOOTHING = 0.25  # distance of the curve from a view, relative to the median step between consecutive views
-UP_WEIGHT = 0.1  # of up vectors relative to positions, times the distance
+UP_WEIGHT = 0.1  # weight of up vectors relative to positions, in units of the distance
 MAX_VIEWS = 1000  # in a tour, evenly sampled by name
 ROUNDS = 20  # of 2-opt
 
@@ -345,7 +345,7 @@ def fly_through(rig: Rig, frames: int, size: Size) -> list[View]:
     return look_at_targets(track[:, :3], track[:, 3:6], track[:, 6:], rig, size)
 
 
-def views(rig: Rig, frames: int, size: Size) -> list[View]:
+def select_views(rig: Rig, frames: int, size: Size) -> list[View]:
     """Return at most `frames` of the views, at even intervals in their order, with their images fitted into `size`."""
     indices = np.unique(np.linspace(0, len(rig.views) - 1, min(frames, len(rig.views))).round().astype(int))
     return [
@@ -370,7 +370,7 @@ PATHS: dict[str, Callable[[Rig, int, Size], list[View]]] = {
     "spiral": spiral,
     "orbit": orbit,
     "through": fly_through,
-    "views": views,
+    "views": select_views,
     "fixed": stay_at_center,
 }
 
