@@ -2,7 +2,7 @@
  *
  * adam_step reads gradients from memory.  update_gaussians computes the gradients of the projection itself, which saves
  * writing and reading 59 values per Gaussian; its results equal those of project_backward and adam_step bit for bit.
- * It also adds the view to the statistics that density.cl would read gradients from memory for.
+ * It can sum the records of pairs itself (gather.cl), and add the view to statistics (density.cl).
  *
  * `every`: all ones to update all Gaussians; 0: the values and moments of culled Gaussians do not change.
  * `undrawn`: all ones to update vectors without a Gaussian in the view at once; 0: their harmonics are updated later
@@ -11,6 +11,7 @@
  * One item = LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"
 #include "backward.h"
+#include "pair_sums.h"
 
 /* What update_gaussians writes in addition to the parameters, as bits of `outputs`. */
 #define OUTPUT_MEAN2D 1    // the gradient of the projected means
@@ -126,7 +127,10 @@ void update_gaussians(
     __global const float *restrict filter_variance,  // [S] scene units^2
     __constant camera_t *restrict camera,            // [1]
     __global const float *restrict splats,           // [N,RECORD] see splat.h
-    __global const float *restrict pixel_sums,       // [PIXEL_SUMS,S] see splat.h
+    __global const float *restrict pixel_sums,       // [PIXEL_SUMS,S] see splat.h; read unless `has_pairs`
+    __global const float *restrict pair_sums,        // [P,RECORD]
+    __global const uint *restrict first_pair,        // [N]
+    __global const uint *restrict tile_count,        // [N]
     __global float *restrict grad_mean2d,            // [2,S] px^-1
     __global const float *restrict radius,           // [S] px, 0 = not seen
     __global float *restrict seen,                   // [S] views
@@ -150,6 +154,7 @@ void update_gaussians(
     const uint sh_rest_degree,                       // of the bands to update: 0 or `degree`
     const float half_width,                          // px
     const float half_height,                         // px
+    const uint has_pairs,                            // 1: sum the records of pairs, as sum_records does
     const uint outputs,
     const uint every,
     const uint undrawn,
@@ -166,7 +171,10 @@ void update_gaussians(
     VF weights[VECTORS][16], m[VECTORS][PIXEL_SUMS];
     for (uint v = 0; v < VECTORS && i + v * LANES < count; v++) {
         const uint at = i + v * LANES;
-        load_sums(pixel_sums, stride, at, m[active]);
+        if (has_pairs)
+            sum_pairs(pair_sums, first_pair, tile_count, pixel_sums, 0, stride, count, at, m[active]);
+        else
+            load_sums(pixel_sums, stride, at, m[active]);
         color_backward(splats, m[active], count, at, g + active);
         first[active] = at;
         updated[active] = g[active].touched | (VI)((int)every);

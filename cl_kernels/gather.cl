@@ -1,8 +1,8 @@
 /* Operations on rows of tables: sum the gradient records of each Gaussian, reorder tables, write rows from the host.
  * No local memory.  Deterministic: every value has one writer, and sums have a fixed order. */
-#include "splat.h"
+#include "pair_sums.h"
 
-/* One item = LANES Gaussians; the pairs of a Gaussian are contiguous and summed in order: deterministic. */
+/* One item = LANES Gaussians. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sum_records(
     __global const float *restrict pair_sums,  // [P,RECORD]
@@ -16,28 +16,10 @@ void sum_records(
     const uint i = get_global_id(0) * LANES;
     if (i >= count)
         return;
-    __global const sums_part_t *records = (__global const sums_part_t *)pair_sums;
-    const size_t parts = RECORD * sizeof(float) / sizeof(sums_part_t);
-    sums_part_t table[LANES][SUMS_PARTS];
-    for (uint lane = 0; lane < LANES; lane++) {
-        float *sums = (float *)table[lane];
-        for (uint k = 0; k < SUMS_PARTS; k++)
-            table[lane][k] = (sums_part_t)(0.0f);
-        if (accumulate)
-            for (uint k = 0; k < PIXEL_SUMS; k++)
-                sums[k] = pixel_sums[k * stride + i + lane];
-        const uint pairs = i + lane < count ? tile_count[i + lane] : 0;
-        const uint first = pairs > 0 ? first_pair[i + lane] : 0;
-        for (uint pair = first; pair < first + pairs; pair++)
-            for (uint k = 0; k < SUMS_PARTS; k++)
-                table[lane][k] += records[pair * parts + k];
-    }
-    for (uint k = 0; k < PIXEL_SUMS; k++) {
-        float lanes[LANES];
-        for (uint lane = 0; lane < LANES; lane++)
-            lanes[lane] = ((const float *)table[lane])[k];
-        VSTORE(VLOAD_PRIVATE(lanes), pixel_sums + k * stride + i);
-    }
+    VF m[PIXEL_SUMS];
+    sum_pairs(pair_sums, first_pair, tile_count, pixel_sums, accumulate, stride, count, i, m);
+    for (uint k = 0; k < PIXEL_SUMS; k++)
+        VSTORE(m[k], pixel_sums + k * stride + i);
 }
 
 /* Row i of `moved` is row source[i] of `table`; fresh rows are zero where `zero_fresh` is 1.

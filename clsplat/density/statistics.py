@@ -181,10 +181,15 @@ class SplatStats:
         """The number of views in which each Gaussian is visible, [S]."""
         return self.gaussians[SEEN]
 
+    @property
+    def is_in_update(self) -> bool:
+        """Whether `Adam.update` adds a view to all statistics."""
+        return len(self.columns) == bool(self._in_update)
+
     def update_arguments(self) -> dict[str, Any]:
         """Return arguments with which `Adam.update` adds a view to the number of views and to at most one statistic."""
         name = self._in_update
-        bits = _SEEN | (IN_UPDATE[name] if name else 0) | (_MEAN2D if len(self.columns) > bool(name) else 0)
+        bits = _SEEN | (IN_UPDATE[name] if name else 0) | (0 if self.is_in_update else _MEAN2D)
         return {"seen": self.view_count, "norms": self.total(name) if name else self.view_count, "outputs": bits}
 
     def add(self, gradients: ViewGradients, grad_mean2d: Array, after_update: bool = False) -> None:

@@ -13,7 +13,7 @@ from clsplat.gaussians.structs import GaussianGradients
 from clsplat.opencl.device import Array
 from clsplat.photos.depths import KnownDepths
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.rasterizer import Content, Frame
+from clsplat.render.rasterizer import Content, Frame, PixelSums
 from clsplat.render.workspace import Workspace
 
 
@@ -87,7 +87,12 @@ class ViewLosses:
 class ViewGradients(ViewLosses):
     """A view's frame, its losses, and the pixel sums from which gradients are computed; valid until the next view."""
 
-    pixel_sums: Array  # [PIXEL_SUMS or more, S]
+    sums: PixelSums | Array
+
+    @property
+    def pixel_sums(self) -> Array:
+        """The sums over pixels, [PIXEL_SUMS or more, S]."""
+        return self.sums if isinstance(self.sums, Array) else self.sums.array
 
 
 class Loss(Settings):

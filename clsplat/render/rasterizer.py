@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -24,20 +25,18 @@ from clsplat.render.workspace import Workspace
 INVERSE_DEPTHS = "inverse_depth_sums"  # name in the workspace
 
 
-def sum_records(
-    pair_sums: Array,
-    lists: TileLists,
-    gaussians: Gaussians,
-    pixel_sums: Array,
-    defines: Mapping[str, int],
-    accumulate: int,
-) -> None:
+def sum_defines(pixel_sums: Array) -> dict[str, int]:
+    """Return the macro with the number of sums, unless it is the default.  pixel_sums: [count, S]."""
+    return {} if pixel_sums.shape[0] == PIXEL_SUMS else {"PIXEL_SUMS": pixel_sums.shape[0]}
+
+
+def sum_records(pair_sums: Array, lists: TileLists, gaussians: Gaussians, pixel_sums: Array, accumulate: int) -> None:
     """Sum the records of pairs, [P, RECORD], for each Gaussian, into `pixel_sums`, [PIXEL_SUMS, S].
 
-    defines: contains PIXEL_SUMS unless it is the default; accumulate: 1 to add to existing sums.
+    accumulate: 1 to add to existing sums.
     """
     device = gaussians.device
-    device.program("gather.cl", **defines).sum_records(
+    device.program("gather.cl", **sum_defines(pixel_sums)).sum_records(
         items=-(-gaussians.count // int(device.tuning["LANES"])),
         pair_sums=pair_sums,
         first_pair=lists.first_pair,
@@ -206,6 +205,26 @@ def pose_gradient(
     )
     read_group_sums = sums.get_later()
     return lambda: np.cumsum(read_group_sums(), axis=1, dtype=np.float64)[:, -1]
+
+
+class PixelSums:
+    """Sums over each Gaussian's pixels, which are records of pairs until `array` is read or a kernel sums them."""
+
+    def __init__(self, array: Array, pairs: dict[str, Array], launch: Callable[[], None] | None) -> None:
+        """launch: sums the records of `pairs` into `array`, [count, S]; None if it has their sums."""
+        self._array, self._pairs, self._launch = array, pairs, launch
+
+    @property
+    def array(self) -> Array:
+        """The sums, [count, S]; the records are summed when it is read first."""
+        if self._launch:
+            self._launch()
+            self._launch = None
+        return self._array
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of a kernel that sums records itself unless `array` has their sums."""
+        return {"pixel_sums": self._array, **self._pairs, "has_pairs": int(self._launch is not None)}
 
 
 @dataclass(frozen=True)
@@ -385,6 +404,18 @@ class Rasterizer:
         sums need `texture`, [rows, stride], negative if unknown.  transmittance_gradient: [rows, stride] T dL/dT of a
         loss on the transmittance T.  Memory is limited as in `forward`.
         """
+        return self.backward(model, frame, grad_image, count, texture, transmittance_gradient).array
+
+    def backward(
+        self,
+        model: DeviceModel,
+        frame: Frame,
+        grad_image: Array,
+        count: int = PIXEL_SUMS,
+        texture: Array | None = None,
+        transmittance_gradient: Array | None = None,
+    ) -> PixelSums:
+        """Return the result of `pixel_sums`, valid until the next call; the records of pairs may not be summed yet."""
         bands = frame.bands
         while True:
             try:
@@ -403,7 +434,7 @@ class Rasterizer:
         count: int,
         texture: Array | None,
         transmittance_gradient: Array | None,
-    ) -> Array:
+    ) -> PixelSums:
         lists, pixel_sums = frame.lists, self.workspace.array("pixel_sums", (count, model.gaussians.capacity))
         changes = {
             "camera": frame.camera.array,
@@ -411,14 +442,19 @@ class Rasterizer:
             "texture": texture or frame.transmittance,  # the kernel reads it only with texture sums
             "behind": transmittance_gradient or frame.transmittance,
         }
+        is_summed = len(bands) > 1 or frame.content == "inverse_depth"
         for i, band in enumerate(bands):
             if len(bands) > 1:
                 _, lists = self._list_band(frame.model, frame.camera, band, frame.content)
             changes["pair_sums"] = self.workspace.array("pair_sums", (lists.pairs, RECORD))
-            self._sum_band(
-                model, frame, band, lists, pixel_sums, changes, is_first=i == 0, has_behind=bool(transmittance_gradient)
-            )
-        return pixel_sums
+            flags = {"is_summed": is_summed, "is_first": i == 0, "has_behind": bool(transmittance_gradient)}
+            self._sum_band(model, frame, band, lists, pixel_sums, changes, **flags)
+        pair_sums, gaussians = changes["pair_sums"], model.gaussians
+        pairs = {"pair_sums": pair_sums, "first_pair": lists.first_pair, "tile_count": lists.tile_count}
+        key = "sum records", gaussians.key, count, pair_sums.buffer.serial, lists.key
+        inputs = pair_sums, lists, gaussians, pixel_sums, 0
+        launch = partial(self.workspace.plans.run, key, {}, sum_records, *inputs)
+        return PixelSums(pixel_sums, pairs, None if is_summed else launch)
 
     def _sum_band(
         self,
@@ -430,13 +466,12 @@ class Rasterizer:
         changes: dict[str, Any],
         **flags: bool,
     ) -> None:
-        """Add the sums over the pixels of a band to `pixel_sums`, or overwrite it in the first band."""
+        """Compute the records of a band's pairs; add their sums to `pixel_sums`, or overwrite it in the first band."""
 
         def launch() -> None:
-            defines = {} if pixel_sums.shape[0] == PIXEL_SUMS else {"PIXEL_SUMS": pixel_sums.shape[0]}
-            blend_defines = {**defines, **model.defines, **({"GRAD_BEHIND": 1} if flags["has_behind"] else {})}
+            behind = {"GRAD_BEHIND": 1} if flags["has_behind"] else {}
             for first_tile, groups in self._launches(band):
-                self._blend(frame.content, **blend_defines).blend_backward(
+                self._blend(frame.content, **sum_defines(pixel_sums), **model.defines, **behind).blend_backward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
                     tile_pairs=lists.tile_pairs,
@@ -448,7 +483,8 @@ class Rasterizer:
                     **changes,
                 )
             pair_sums, accumulate = changes["pair_sums"], int(not flags["is_first"])
-            sum_records(pair_sums, lists, model.gaussians, pixel_sums, defines, accumulate)
+            if flags["is_summed"]:
+                sum_records(pair_sums, lists, model.gaussians, pixel_sums, accumulate)
             if frame.content == "inverse_depth":
                 sum_inverse_depths(self.workspace, pair_sums, lists, model.gaussians, accumulate)
 

@@ -16,7 +16,7 @@ from clsplat.gaussians.sh_offload import slot_arguments, slot_defines
 from clsplat.gaussians.structs import DeferredUpdates, GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
 from clsplat.opencl.plan import Plans
-from clsplat.render.rasterizer import Frame, projection_arguments
+from clsplat.render.rasterizer import Frame, PixelSums, projection_arguments, sum_defines
 from clsplat.training.motion import MotionRates, update_motion
 
 
@@ -128,7 +128,7 @@ class Adam:
         self,
         model: DeviceModel,
         frame: Frame,
-        pixel_sums: Array,
+        pixel_sums: PixelSums | Array,
         rates: dict[str, float],
         rows: Rows = "all",
         statistics: Mapping[str, Any] | None = None,
@@ -140,17 +140,21 @@ class Adam:
         written.
         """
         gaussians, rows, grad_mean2d = self.gaussians, self._effective_rows(rows), self._mean2d()
-        unused = {"seen": grad_mean2d, "norms": grad_mean2d}
-        outputs = {**unused, "radius": frame.radius, "outputs": _MEAN2D, **(statistics or {})}
-        bits = outputs.pop("outputs")
-        defines = {**model.defines, **({"PIXEL_SUMS": pixel_sums.shape[0]} if bits & _ABS_NORM else {})}
+        sums = {"pixel_sums": pixel_sums, "has_pairs": 0} if isinstance(pixel_sums, Array) else pixel_sums.arguments()
+        unused = {"first_pair": frame.depth_key, "tile_count": frame.depth_key, "pair_sums": grad_mean2d}
+        changes: dict[str, Any] = {
+            "camera": frame.camera.array,
+            **{name: sums.pop(name, array) for name, array in unused.items()},
+        }
+        arrays = {"splats": frame.splats, "grad_mean2d": grad_mean2d, "radius": frame.radius, **sums}
+        arrays |= statistics or {"seen": grad_mean2d, "norms": grad_mean2d, "outputs": _MEAN2D}
+        numbers = {name: arrays.pop(name) for name in ("has_pairs", "outputs")}
+        defines = sum_defines(arrays["pixel_sums"]) if numbers["outputs"] & _ABS_NORM else {}
         deferred = self._prepare_deferred(rows, model, rates)
-        changes: dict[str, Any] = {"camera": frame.camera.array}
         for name, (rate_name, correction_name) in _FACTORS.items():
             changes[rate_name], changes[correction_name] = self._count_update(name, rates)
         changes["sh_rest_degree"] = model.degree if rates["sh_rest"] else 0
         changes["half_width"], changes["half_height"] = frame.camera.width / 2, frame.camera.height / 2
-        arrays = {"splats": frame.splats, "pixel_sums": pixel_sums, "grad_mean2d": grad_mean2d, **outputs}
 
         def launch() -> None:
             tables: dict[str, Any] = {
@@ -158,17 +162,16 @@ class Adam:
                 for name in PARAMETERS
                 for number, table in enumerate(moment_tables(name), 1)
             }
-            gaussians.device.program("adam.cl", **defines).update_gaussians(
+            gaussians.device.program("adam.cl", **defines, **model.defines).update_gaussians(
                 items=-(-gaussians.count // (self._lanes * self._vectors)),
-                **{**projection_arguments(model, frame.camera), **arrays, **changes},
+                **{**projection_arguments(model, frame.camera), **arrays, **numbers, **changes},
                 **tables,
                 sh_base=gaussians["sh_base"],
-                outputs=bits,
                 every=_EVERY[rows],
                 undrawn=_UNDRAWN[rows],
             )
 
-        key = "update", model.key, rows, bits, *(array.buffer.serial for array in arrays.values())
+        key = "update", model.key, rows, *numbers.values(), *(array.buffer.serial for array in arrays.values())
         self._plans.run(key, changes, launch)
         self._record_sh(deferred, frame, changes["sh_rest_rate"], changes["sh_rest_correction2"])
         return grad_mean2d

@@ -137,12 +137,12 @@ class StepTrainer:
             module.backward(data)
         self.rasterizer.device.timings.section = "statistics"
         texture = unmasked_gradient(workspace, data.camera, data.planes.colors, mask) if sum_count > TEXTURE else None
-        data.pixel_sums = self.rasterizer.pixel_sums(
+        data.sums = self.rasterizer.backward(
             data.model, data.frame, data.gradient, sum_count, texture, data.transmittance_gradient
         )
         for module in reversed(data.modules):
             module.after_backward(data)
-        return ViewGradients(data.frame, data.comparison, data.losses, data.pixel_sums, step=data)
+        return ViewGradients(data.frame, data.comparison, data.losses, data.sums, step=data)
 
     def update(self, gradients: ViewGradients, frozen: Collection[str] = ()) -> None:
         """Update the parameters, Adam's moments, the statistics, and the modules with the result of `differentiate`."""
@@ -165,7 +165,8 @@ class StepTrainer:
         gaussians, has_depth = self.model.gaussians, view_gradients.frame.content == "inverse_depth"
         has_several_views = self.views_per_update != 1
         if not (penalties or frozen or gaussians.is_moving or has_depth or has_several_views):
-            inputs = self.model, view_gradients.frame, view_gradients.pixel_sums, rates, self.rows
+            sums = view_gradients.sums if self.stats.is_in_update else view_gradients.pixel_sums
+            inputs = self.model, view_gradients.frame, sums, rates, self.rows
             return self.adam.update(*inputs, self.stats.update_arguments()), True
         gradients = self.rasterizer.gradients(self.model, view_gradients.frame, view_gradients.pixel_sums)
         is_deferred = self.rows == "deferred" or gaussians.on_host

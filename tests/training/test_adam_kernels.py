@@ -6,9 +6,11 @@ import pytest
 from clsplat.conformance.checks.projection import undrawable_case
 from clsplat.conformance.checks.training import check_average, check_rows, check_step, move_every_fifth_behind
 from clsplat.conformance.scenes import Case, add_world_filter, random_case
+from clsplat.density.statistics import SplatStats
 from clsplat.formats.splats import PARAMETERS
 from clsplat.gaussians.gaussians import DeviceModel
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
+from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.training import adam as average
@@ -86,27 +88,28 @@ def test_steps(device, rng, count):
     ),
 )
 def test_fused_update_equals_stored_gradients(device, rng, count, degree, sh_rest, rows):
-    """update_gaussians against project_backward and adam_step, bit for bit, moments and screen gradients too."""
+    """update_gaussians against the separate kernels, bit for bit, moments, screen gradients, and statistics too."""
     case = move_every_fifth_behind(add_world_filter(random_case(rng, count, degree=degree, compensate=1.0), rng))
     weights = rng.normal(size=(3, 32, 48)).astype(np.float32)
     weights[:, 30:], weights[:, :, 40:] = 0, 0
-    tables = []
+    tables, statistic = [], "screen_grad_abs" if degree == 2 else "screen_grad"
     for fused in (False, True):
         rasterizer, model = Rasterizer(device, "radix"), case.model(device)
         camera = case.device_camera(device)
-        adam = Adam(model.gaussians)
+        adam, stats = Adam(model.gaussians), SplatStats(model.gaussians, [statistic, "screen_radius"])
         for step in (2, 3, 4):
             rates = Rates(sh_rest=sh_rest).at(step, extent=2.0)
             frame = rasterizer.forward(model, camera, device.zeros(3))
-            pixel_sums = rasterizer.pixel_sums(
-                model, frame, device.upload(weights[:, : camera.rows, : camera.stride].copy())
-            )
+            weight_planes = device.upload(weights[:, : camera.rows, : camera.stride].copy())
+            sums = rasterizer.backward(model, frame, weight_planes, stats.pixel_sums)
             if fused:
-                grad_mean2d = adam.update(model, frame, pixel_sums, rates, rows)
+                inputs = model, frame, sums.array if step == 3 else sums, rates, rows
+                grad_mean2d = adam.update(*inputs, stats.update_arguments())
             else:
-                gradients = rasterizer.gradients(model, frame, pixel_sums)
+                gradients = rasterizer.gradients(model, frame, sums.array)
                 adam.step(model, frame, gradients, rates, rows=rows)
                 grad_mean2d = gradients.mean2d
+            stats.add(ViewGradients(frame, None, [], sums), grad_mean2d, after_update=fused)
         mean2d = grad_mean2d.get()[:, :count]
         tables.append({"mean2d": mean2d, **{name: model.gaussians.get(name) for name in model.gaussians.tables}})
     assert count == 1 or (tables[0]["means"] != case.parameters["means"]).any()

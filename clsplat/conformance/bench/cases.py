@@ -97,7 +97,7 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
 
     Blending is counted in vector instructions of 16 lanes (31 per row forward; 80 per row and 60 per pair backward),
     issued at the rate of multiply-adds.  Other stages are counted in operations and bytes: 236 bytes of parameters per
-    Gaussian, 59 parameters with a gradient and two moments, 64 bytes per record, and so on.
+    Gaussian, 59 parameters with two moments, 64 bytes per record, 20 bytes of statistics, and so on.
     """
     n, pairs, pixels = work.gaussians, work.pairs, work.pixels
 
@@ -112,9 +112,7 @@ def floors(work: Work, peaks: Peaks) -> dict[str, float]:
         "blend": floor(31 * vector * work.rows, 64 * pairs),
         "loss": floor(1250 * pixels, 60 * pixels),
         "blend backward": floor(vector * (80 * work.rows + 60 * pairs), 128 * pairs),
-        "sum records": floor(9 * pairs, 64 * pairs + 36 * n),
-        "update": floor((900 + 12 * 59) * n, (64 + 36 + 8 + 24 * 59) * n),
-        "statistics": floor(0, 20 * n),
+        "update": floor((900 + 12 * 59) * n + 9 * pairs, 64 * pairs + (64 + 8 + 20 + 24 * 59) * n),
     }
 
 

@@ -20,8 +20,8 @@ from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.losses.base import Penalty, PenaltyInputs
 from clsplat.losses.penalties import Anisotropy, CovarianceTrace, MeanOpacity, MeanScale, MinScale
 from clsplat.methods.natural_selection import OpacityPressure
-from clsplat.opencl.device import Array, Device, constants
-from clsplat.render.rasterizer import PIXEL_SUMS, RECORD, Frame, Rasterizer
+from clsplat.opencl.device import Device, constants
+from clsplat.render.rasterizer import PIXEL_SUMS, RECORD, Frame, PixelSums, Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.training import adam
 from clsplat.training.adam import Adam, Rates, Rows
@@ -72,13 +72,13 @@ def _random_pixel_sums(
     rasterizer: Rasterizer,
     model: DeviceModel,
     count: int = PIXEL_SUMS,
-) -> tuple[Frame, Array]:
+) -> tuple[Frame, PixelSums]:
     """Return the frame of a case, and its sums over pixels for a random gradient of the image."""
     camera = case.device_camera(device)
     frame = rasterizer.forward(model, camera, device.upload(BACKGROUND))
     weights = np.zeros((3, camera.rows, camera.stride), np.float32)
     weights[:, : camera.height, : camera.width] = rng.normal(size=(3, camera.height, camera.width))
-    return frame, rasterizer.pixel_sums(model, frame, device.upload(weights), count)
+    return frame, rasterizer.backward(model, frame, device.upload(weights), count)
 
 
 def check_fused(
@@ -93,10 +93,11 @@ def check_fused(
     gaussians, adam, rates = model.gaussians, Adam(model.gaussians), Rates().at(3, extent=2.0)
     stats = SplatStats(gaussians, [statistic, "screen_radius"])  # the update does not add the radius
     frame, pixel_sums = _random_pixel_sums(device, rng, case, rasterizer, model, stats.pixel_sums)
+    pixel_sums.arguments()["pixel_sums"].fill(7)  # the update does not read them
     stats.view_count.fill(2)
     stats.total(statistic).fill(1)
     grad_mean2d = adam.update(model, frame, pixel_sums, rates, statistics=stats.update_arguments()).get()[:, :count].T
-    sums = pixel_sums.get()[:, :count].T.astype(np.float64)
+    sums = pixel_sums.array.get()[:, :count].T.astype(np.float64)
     expected = expected_gradients(case, case.project(), sums[:, :PIXEL_SUMS])
     yield compare(kernel, f"gradients of the projected means, {label}", grad_mean2d, expected["mean2d"], CONIC)
     planes, is_visible = sums[:, ABS_X:] if stats.pixel_sums > ABS_X else grad_mean2d, frame.radius.get()[:count] > 0
@@ -125,7 +126,7 @@ def check_rows(device: Device, rng: np.random.Generator, case: Case, label: str)
         rasterizer, model = Rasterizer(device, "radix"), case.model(device)
         gaussians, adam = model.gaussians, Adam(model.gaussians)
         frame, pixel_sums = _random_pixel_sums(device, rng, case, rasterizer, model)
-        gradients = rasterizer.gradients(model, frame, pixel_sums)
+        gradients = rasterizer.gradients(model, frame, pixel_sums.array)
         is_visible = frame.splats.get().reshape(-1, RECORD)[:count, SPLAT_OPACITY] > 0
         adam.updates = dict.fromkeys(PARAMETERS, 4)
         expected: dict[str, NDArray[Any]] = {}

@@ -18,7 +18,7 @@ from clsplat.opencl.device import Array
 from clsplat.photos.photographs import Photograph
 from clsplat.photos.transforms import PhotographTransform, Planes
 from clsplat.render.camera import DeviceCamera
-from clsplat.render.rasterizer import Frame, Rasterizer
+from clsplat.render.rasterizer import Frame, PixelSums, Rasterizer
 from clsplat.render.workspace import Workspace
 from clsplat.scene.scene import Scene
 from clsplat.scene.view import View
@@ -48,9 +48,14 @@ class TrainingStep:
     transmittance_gradient: Array | None = None  # T dL/dT, [1, rows, stride]
     losses: list[LossValue] = field(default_factory=list)
     module_losses: list[LossValue] = field(default_factory=list)
-    pixel_sums: Array = field(init=False)
+    sums: PixelSums = field(init=False)
     modules: "Sequence[ModuleState]" = ()  # forward in this order, backward in reverse
     _saved: dict[int, Any] = field(default_factory=dict)
+
+    @property
+    def pixel_sums(self) -> Array:
+        """The sums over each Gaussian's pixels, [PIXEL_SUMS or more, S], after the backward pass."""
+        return self.sums.array
 
     @property
     def camera(self) -> DeviceCamera:
