@@ -158,6 +158,7 @@ def test_table_of_a_scene_has_a_row_for_each_stage():
         memory=2**24,
         planned=2**25,
         launches=20,
+        bytes=7 * 2**20,
     )
     earlier = {"stages": {"project": 2.4, "blend": 0.0}, "host": 1.0, "step": 44.0, "densify": 1.0}
     lines = [line.split() for line in table("A", result, earlier).splitlines()]

@@ -82,6 +82,9 @@ def measure_peaks(device: Device, repeats: int = 5) -> Peaks:
     return Peaks(16 * work / fma_time / 1e9, 2 * work / exp_time / 1e9, 8 * length / copy_time / 1e9)
 
 
+LOSS_BYTES = 3 + 12 + 36 + (24 + 36) + (36 + 24 + 24)  # unpack the photograph, L1, maps and gradient of the SSIM
+
+
 @dataclass(frozen=True)
 class Work:
     """The amount of work of one training step."""
@@ -92,27 +95,42 @@ class Work:
     pixels: int
 
 
-def floors(work: Work, peaks: Peaks) -> dict[str, float]:
-    """Return a lower bound on the time of each stage, in ms.
+def traffic(work: Work) -> dict[str, int]:
+    """Return the bytes that each stage of a step with L1 and D-SSIM reads and writes, each value once per kernel.
 
-    Blending is counted in vector instructions of 16 lanes (31 per row forward; 80 per row and 60 per pair backward),
-    issued at the rate of multiply-adds.  Other stages are counted in operations and bytes: 236 bytes of parameters per
-    Gaussian, 59 parameters with two moments, 64 bytes per record, 20 bytes of statistics, and so on.
+    These are 236 bytes of parameters per Gaussian, 59 parameters with two moments, 64 bytes per record, 20 bytes of
+    statistics, nine derivatives of the SSIM per pixel, and so on.
     """
     n, pairs, pixels = work.gaussians, work.pairs, work.pixels
-
-    def floor(operations: float, traffic: float) -> float:
-        return 1e3 * max(operations / (1e9 * peaks.gflops), traffic / (1e9 * peaks.gbytes))
-
-    vector = 2 * 16  # operations of a multiply-add instruction
     return {
-        "project": floor(380 * n, (236 + 64 + 8) * n),
-        "pairs": floor(80 * pairs, 2 * 64 * n + 12 * pairs),
-        "sort": floor(0, 64 * n + 24 * pairs),
-        "blend": floor(31 * vector * work.rows, 64 * pairs),
-        "loss": floor(1250 * pixels, 60 * pixels),
-        "blend backward": floor(vector * (80 * work.rows + 60 * pairs), 128 * pairs),
-        "update": floor((900 + 12 * 59) * n + 9 * pairs, 64 * pairs + (64 + 8 + 20 + 24 * 59) * n),
+        "project": (236 + 64 + 28) * n,
+        "pairs": 2 * 64 * n + 12 * pairs,
+        "sort": 64 * n + 24 * pairs,
+        "blend": 64 * pairs + 16 * pixels,
+        "loss": LOSS_BYTES * pixels,
+        "blend backward": 128 * pairs + 24 * pixels,
+        "update": 64 * pairs + (64 + 8 + 20 + 24 * 59) * n,
+    }
+
+
+def floors(work: Work, peaks: Peaks) -> dict[str, float]:
+    """Return a lower bound on the time of each stage, in ms, from its operations and from its bytes.
+
+    Blending is counted in vector instructions of 16 lanes (31 per row forward; 80 per row and 60 per pair backward),
+    issued at the rate of multiply-adds.
+    """
+    n, pairs, vector = work.gaussians, work.pairs, 2 * 16  # operations of a multiply-add instruction
+    operations = {
+        "project": 380 * n,
+        "pairs": 80 * pairs,
+        "blend": 31 * vector * work.rows,
+        "loss": 1250 * work.pixels,
+        "blend backward": vector * (80 * work.rows + 60 * pairs),
+        "update": (900 + 12 * 59) * n + 9 * pairs,
+    }
+    return {
+        stage: 1e3 * max(operations.get(stage, 0) / (1e9 * peaks.gflops), size / (1e9 * peaks.gbytes))
+        for stage, size in traffic(work).items()
     }
 
 
@@ -136,6 +154,7 @@ class BenchResult:
     memory: int  # bytes on the device, at peak
     planned: int  # bytes, from the memory plan of training
     launches: int  # kernels in a step
+    bytes: int  # that the kernels of a step read and write, see `traffic`
 
 
 class BenchCase:
@@ -220,8 +239,8 @@ class BenchCase:
         step = statistics.median(self.step_times)
         host = step - sum(stages.values())
         steps, densify_ms = statistics.median(self.mean_step_times), statistics.median(self.densify_times[1:])
-        memory = self.memory, self._planned_bytes()
-        return BenchResult(work, stages, floors(work, peaks), step, steps, densify_ms, host, *memory, self.launches)
+        memory, launches = (self.memory, self._planned_bytes()), (self.launches, sum(traffic(work).values()))
+        return BenchResult(work, stages, floors(work, peaks), step, steps, densify_ms, host, *memory, *launches)
 
     def _planned_bytes(self) -> int:
         camera = self.photograph.camera

@@ -96,7 +96,7 @@ def table(name: str, result: BenchResult, earlier: dict[str, Any] | None) -> str
         comparison = (f"{old_ms:.2f}", f"{ms / old_ms:.2f}") if old_ms > 0 else ()
         cells.append([stage, f"{ms:.2f}", *ratio, *comparison])
     memory = f"memory {result.memory / mib:,.0f} MiB at peak; training plans {result.planned / mib:,.0f} MiB"
-    rest = f"{memory}; {result.launches} kernel launches per step"
+    rest = f"{memory}; {result.launches} kernel launches and {result.bytes / mib:,.0f} MiB of traffic per step"
     return f"scene {name}: {counts}\n" + textwrap.indent(f"{text_table(cells, left_columns=1)}\n{rest}", "  ")
 
 
