@@ -34,7 +34,7 @@ OTHER_BUILDS = {
 
 def like(device, **changes):
     return SimpleNamespace(
-        **{"info": device.info, "schedule": device.schedule, "tuning": device.tuning, "text": "x", **changes}
+        **{"info": device.info, "schedule": device.schedule, "tuning": device.tuning, "label": "x", **changes}
     )
 
 

@@ -167,7 +167,7 @@ def test_field_file_without_a_unit_is_in_scene_units(tmp_path):
     with pytest.raises(DataError, match="unit 'auto' instead of a number"):
         load_field(tmp_path / "auto.npz")
     with pytest.raises(ValueError, match=r"'auto'; use FieldShape\.with_unit"):
-        FieldModel(FieldShape(), np.zeros(FieldShape().parameters, np.float32), Rendering())
+        FieldModel(FieldShape(), np.zeros(FieldShape().table_length, np.float32), Rendering())
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.sog", "a.glb", "a.splat"])

@@ -243,8 +243,8 @@ def test_invalid_command_ends_in_one_line(options, message, few_steps, tmp_path)
         ({"size": "8192x32", "side": "photograph"}, "size \\(16384, 32\\)"),
         ({"fps": float("nan")}, "expected frames per second"),
         ({"video": None, "side": "photograph"}, "--side needs --video"),
-        ({"kind": "gif", "video": None}, "expected png or npy, got 'gif'"),
-        ({"kind": "npy"}, "--format npy is for images"),
+        ({"format": "gif", "video": None}, "expected png or npy, got 'gif'"),
+        ({"format": "npy"}, "--format npy is for images"),
         ({"side": "no.ply"}, "no.ply"),
     ],
 )
