@@ -435,7 +435,7 @@ def write_primitive(
 
 
 def _origin(splats: SplatFile) -> list[float] | None:
-    """Return the origin of a model, [3], in the axes of glTF, or None."""
+    """Return the origin of a model, [3], in the axes of glTF, or None if it has none."""
     origin: list[float] | None = splats.rendering.get("origin")
     return origin and (np.array(FLIP) * origin).tolist()
 

@@ -192,8 +192,9 @@ def endings(reads: bool = False) -> list[str]:
 
 
 def detect(path: Path) -> Codec | None:
-    """Return the format of a file by its content, or None.  If a format has no magic number, the name must match, too.
+    """Return the format of a file by its content, or None if no format matches.
 
+    If a format has no magic number, the name of the file must match, too.
     Raises DataError if the file cannot be read, is empty, or is a failed download.
     """
     with open_file(path, "a model file") as file:
@@ -206,7 +207,7 @@ def detect(path: Path) -> Codec | None:
 
 
 def format_from_name(path: Path) -> Codec | None:
-    """Return the format with the longest ending that matches a file name, or None."""
+    """Return the format with the longest ending that matches a file name, or None if none matches."""
     name = path.name.lower()
     pairs = [(end, codec) for codec in CODECS for end in codec.endings]
     matches = [(end, codec) for end, codec in pairs if name == end or (end.startswith(".") and name.endswith(end))]

@@ -41,7 +41,7 @@ from clsplat.gaussians.motion import evaluate_at, transform_motion
 from clsplat.gaussians.sky import WITHOUT_SKY, Sky, read_sky_file, without_sky_path, write_sky_file
 from clsplat.opencl.device import Device
 from clsplat.scene.quality import near_plane
-from clsplat.scene.scene import Scene, far_origin, format_position
+from clsplat.scene.scene import Scene, choose_origin_near, format_position
 
 # The rendering parameters of a model, as stored in its file.
 
@@ -253,7 +253,7 @@ class Model:
             results: dict[str, Any] = transform(self.tables(), scale, matrix, shift)
             means = results["means"]
             if not origin.any() and np.isfinite(means).all() and not is_float32_precise(means, results["log_scales"]):
-                origin = far_origin(np.median(means, axis=0), means)
+                origin = choose_origin_near(np.median(means, axis=0), means)
                 results["means"] = means - origin
             if self.motion is not None:
                 results["motion"] = transform_motion(self.motion, scale, matrix)
@@ -395,7 +395,7 @@ def load(path: str | Path, options: ReadOptions | None = None) -> Model:
     finite_means = tables["means"][~not_finite({"means": tables["means"]})]
     if not origin.any() and not is_float32_precise(finite_means, tables["log_scales"]):
         finite_means = finite_means.astype(np.float64)
-        origin = far_origin(np.median(finite_means, axis=0), finite_means)
+        origin = choose_origin_near(np.median(finite_means, axis=0), finite_means)
         tables["means"] = np.asarray(tables["means"] - origin, np.float32)
     model = Model(**tables, rendering=Rendering.from_comment(comment, file.mode), sky=sky)
     if file.placement is not None:

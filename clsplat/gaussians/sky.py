@@ -172,7 +172,7 @@ def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
 
 
 def read_sky_file(model: Path, is_expected: bool = False) -> Sky | None:
-    """Return the sky of a model file, or None; warn if the sky is missing but expected, or belongs to another model.
+    """Return the sky of a model file, or None.  Warn if an expected sky is missing, or if the sky is of another model.
 
     Raises DataError if its file is damaged.
     """

@@ -141,7 +141,7 @@ def _far_from_points(points: NDArray[np.floating], shape: tuple[int, ...]) -> Ma
 
 
 def _visible_points(scene: Scene, view: View) -> NDArray[np.float64]:
-    """Return the positions of points in a photograph, [K, 2] px: the points with a track in it, or else all points."""
+    """Return the positions, [K, 2] px, of the points with a track in a photograph; without tracks, of all points."""
     if scene.tracks is not None and view.name in scene.tracks.rows:
         positions = scene.tracks.positions[scene.tracks.rows[view.name]]
     else:

@@ -64,7 +64,7 @@ def write_metrics(pipeline: Pipeline, run: Run) -> None:
 def previous_sums(pipeline: Pipeline, run: Run) -> dict[str, str]:
     """Return the SHA-256, by path in the run folder, of a finished run's files that no remaining stage rewrites.
 
-    Until the run ends again, a change to these files is damage.  The records, and the files of a training stage that
+    A file whose contents differ from this hash is damaged.  The records, and the files of a training stage that
     continues, are included only if they are damaged.
     """
     sums = read_sums(run.out)  # read again: with --minutes this process may have changed them

@@ -296,7 +296,7 @@ class CameraExposure:
 
 
 def read_exif_exposure(path: Path) -> CameraExposure | None:
-    """Return the exposure in the EXIF data of a JPEG file, or None.  Raises DataError when the file cannot be read."""
+    """Return the exposure in the EXIF data of a JPEG file, or None without it.  Raises DataError."""
     tags = _read_tags(path)
     return make_exposure(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
 

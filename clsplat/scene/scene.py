@@ -277,10 +277,10 @@ def choose_origin(views: Sequence[View], points: PointCloud | None) -> Floats:
     """
     centers = np.stack([view.position for view in views])
     positions = centers if points is None else np.asarray(points.positions, np.float64)
-    return far_origin(np.median(centers, axis=0), positions)
+    return choose_origin_near(np.median(centers, axis=0), positions)
 
 
-def far_origin(center: Floats, positions: Floats) -> Floats:
+def choose_origin_near(center: Floats, positions: Floats) -> Floats:
     """Return an origin near `center`, [3]; 0 unless `center` is far from 0 relative to the spread of the positions."""
     spread = float(np.median(np.linalg.norm(positions - center, axis=1)))
     if np.abs(center).max() <= MAX_OFFSET * (spread or 1.0):

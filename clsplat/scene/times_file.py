@@ -23,7 +23,10 @@ def write_times(folder: Path, times: Mapping[str, float]) -> None:
 
 
 def read_times(folder: Path) -> dict[str, float] | None:
-    """Return the timestamps in the times.json of `folder` by photograph, or None without it.  Raises DataError."""
+    """Return the timestamps in the times.json of `folder` by photograph, or None without that file.
+
+    Raises DataError.
+    """
     path = folder / FILE
     if not os.path.lexists(path):  # reading reports a path that is not a file
         return None

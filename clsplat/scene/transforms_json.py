@@ -48,7 +48,7 @@ class JsonFrame:
         self._values, self._defaults = values, shared or {}
 
     def value(self, key: str) -> Any:
-        """Return the unchecked value of a key, or None."""
+        """Return the unchecked value of a key, or None if it is missing."""
         return self._values[key] if key in self._values else self._defaults.get(key)
 
     def array(self, key: str) -> Floats:
@@ -71,7 +71,7 @@ class JsonFrame:
         return float(value)
 
     def file_name(self, key: str) -> str | None:
-        """Return a path with forward slashes and without a leading `./`, or None.  Raises DataError."""
+        """Return a path with forward slashes and no leading `./`, or None if it is missing.  Raises DataError."""
         value = self.value(key)
         if value is not None and not isinstance(value, str):
             raise DataError(f"{self.source}: {key} is {quote(value)}; expected a path below {self.folder}")

@@ -39,7 +39,7 @@ def validate_pose(name: str, pose: ArrayLike) -> Floats:
 
 
 def validate_time(name: str, time: float | None) -> float | None:
-    """Return the time of the view `name`, in [0, 1], or None.  Raises PoseError for anything else."""
+    """Return the time of the view `name`.  Raises PoseError unless it is None or a number in [0, 1]."""
     if time is None:
         return None
     if isinstance(time, bool) or not isinstance(time, int | float | np.floating | np.integer):

@@ -55,7 +55,7 @@ SETTINGS = {
 
 
 def require_certificates(tls: Tls) -> None:
-    """Raise ConfigError with the path if a file cannot be read, or if key and certificate do not match."""
+    """Raise ConfigError if a file of `tls` cannot be read, or if its private key does not match its certificate."""
     for key in ("ca", "cert", "key"):
         try:
             read_file(Path(getattr(tls, key)))

@@ -189,9 +189,9 @@ def _hull(source: DepthSource, blocks: Blocks, voxel: float, cell: float | None)
 
 
 def _box(blocks: Blocks, ratio: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the smallest box of blocks of another step that contains these: its first block and its shape, [3] each.
+    """Return the first block and the shape, [3] each, of the smallest box on another grid that contains these blocks.
 
-    ratio: the step of these blocks divided by the step of the blocks of the box.
+    ratio: the step of the grid of these blocks divided by that of the other grid.
     """
     first = np.floor(blocks.min(axis=0) * ratio).astype(np.int64)
     return first, np.ceil((blocks.max(axis=0) + 1) * ratio).astype(np.int64) - first

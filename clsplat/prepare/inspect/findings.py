@@ -258,8 +258,8 @@ def _check_points(facts: Facts) -> Iterator[Finding]:
     if points.error_mean is not None and points.error_mean >= POSES_ERROR:
         fault = f"the mean reprojection error of the points is {points.error_mean:.2f} px at the full size"
         remedy = (
-            "renders will be blurry; run bundle adjustment (colmap bundle_adjuster), or optimize the cameras too: "
-            f'--set "{POSES}", which `photos` does from {POSES_ERROR:g} px at the training size'
+            "renders will be blurry; run bundle adjustment (colmap bundle_adjuster), or optimize the cameras too with "
+            f'--set "{POSES}"; `photos` does this at {POSES_ERROR:g} px or more at the training size'
         )
         yield Finding("warning" if points.error_mean > MAX_ERROR else "note", fault, remedy)
 

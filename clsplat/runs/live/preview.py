@@ -83,12 +83,12 @@ class RequestQueue:
                 self._requests.remove(request)
 
     def first(self) -> PreviewRequest | None:
-        """Return the oldest request, or None.  Repeated requests for the same camera come last."""
+        """Return the oldest request, or None if there is none.  Repeated requests for the same camera come last."""
         with self._changed:
             return min(self._requests, key=lambda request: request.pace == "again", default=None)
 
     def deliver(self, request: PreviewRequest, image: EncodedImage | None) -> None:
-        """Remove a request from the queue, and pass the image, or None, to the thread that waits for it."""
+        """Remove a request from the queue, and pass the image to the thread that waits for it; None: not rendered."""
         self._drop(request)
         request.image = image
         request.done.set()

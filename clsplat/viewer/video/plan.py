@@ -93,7 +93,7 @@ Position = tuple[float, float, float]
 
 
 def _check_position(option: str, position: Sequence[float] | None) -> Position | None:
-    """Return a position unchanged, or None.  Raises ConfigError unless it is 3 finite numbers."""
+    """Return a position as a tuple; None stays None.  Raises ConfigError unless it is 3 finite numbers."""
     if position is None:
         return None
     if len(position) != 3 or not all(map(math.isfinite, position)):
