@@ -4,8 +4,8 @@
  *   weight w_k = T_k (1 - exp(-s_k e_k)), T_k+1 = T_k exp(-s_k e_k), e_k its length
  *   color of a ray = sum of w_k c_k + (1 - sum of w_k) background
  *
- * The loss of a ray is the squared difference from its pixel times a scale.  Backward: with g_k =
- * dL/dw_k, dL/d(s_k e_k) = T_k+1 g_k - (sum over j > k of w_j g_j), from the last sample to the first.
+ * The loss of a ray is the squared difference from its pixel, times a scale.  Backward, from the last sample to the
+ * first, with g_k = dL/dw_k: dL/d(s_k e_k) = T_k+1 g_k - (sum over j > k of w_j g_j).
  *
  * One item = one ray.  No local memory. */
 #include "layers.h"
@@ -36,14 +36,14 @@ static inline float color_of(const float raw)
 /* Colors and weights of rays. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void composite_forward(
-    __global const float *restrict raw_colors,    // [T,COLOR_ROWS,SAMPLES]
-    __global const float *restrict raw_densities,  // [T,COLOR_ROWS,SAMPLES] the first row
+    __global const float *restrict raw_colors,     // [T,COLOR_ROWS,SAMPLES]
+    __global const float *restrict raw_densities,  // [T,COLOR_ROWS,SAMPLES], in the first row
     __global const float *restrict cones,          // [rays,RAY_STEP]
     __global const float *restrict edges,          // [rays,samples + 1]
     __global const float *restrict background,     // [3]
     __global float *restrict weights,              // [rays,samples]
-    __global float *restrict left,                 // [rays,samples] T_k+1
-    __global float *restrict colors,              // [rays,3]
+    __global float *restrict transmittance,        // [rays,samples] T_k+1
+    __global float *restrict colors,               // [rays,3]
     const uint samples,
     const uint rays)
 {
@@ -62,7 +62,7 @@ void composite_forward(
             sums[channel] += weight * color_of(raw_colors[at + channel * SAMPLES]);
         covered += weight;
         weights[ray * samples + k] = weight;
-        left[ray * samples + k] = through;
+        transmittance[ray * samples + k] = through;
     }
     for (uint channel = 0; channel < 3; channel++)
         colors[ray * 3 + channel] = sums[channel] + (1.0f - covered) * background[channel];
@@ -71,18 +71,18 @@ void composite_forward(
 /* Squared errors of rays, and the gradient of the network's outputs. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void composite_backward(
-    __global const float *restrict raw_colors,    // [T,COLOR_ROWS,SAMPLES]
+    __global const float *restrict raw_colors,     // [T,COLOR_ROWS,SAMPLES]
     __global const float *restrict raw_densities,  // [T,COLOR_ROWS,SAMPLES]
     __global const float *restrict cones,          // [rays,RAY_STEP]
     __global const float *restrict edges,          // [rays,samples + 1]
     __global const float *restrict background,     // [3]
     __global const float *restrict weights,        // [rays,samples]
-    __global const float *restrict left,           // [rays,samples] T_k+1
-    __global const float *restrict colors,        // [rays,3]
+    __global const float *restrict transmittance,  // [rays,samples] T_k+1
+    __global const float *restrict colors,         // [rays,3]
     __global const float *restrict photograph,     // [3,rows,stride]
-    __global const uint *restrict pixels,          // [counted] row * width + column
-    __global float *restrict grad_colors,           // [T,COLOR_ROWS,SAMPLES]
-    __global float *restrict grad_densities,         // [T,COLOR_ROWS,SAMPLES]
+    __global const uint *restrict pixels,          // [pixel_count] row * width + column
+    __global float *restrict grad_colors,          // [T,COLOR_ROWS,SAMPLES]
+    __global float *restrict grad_densities,       // [T,COLOR_ROWS,SAMPLES]
     __global float *restrict errors,               // [rays of the step] from first_ray on
     const float scale,                             // factor on a ray's squared difference
     const uint first_ray,
@@ -90,14 +90,14 @@ void composite_backward(
     const uint stride,
     const uint plane,                              // rows * stride
     const uint samples,
-    const uint counted,                            // rays of pixels; the others fill a tile
+    const uint pixel_count,                        // the rays after these only fill the last tile
     const uint rays)
 {
     const uint ray = get_global_id(0);
     if (ray >= rays)
         return;
-    const float counts = ray < counted ? 1.0f : 0.0f, length = cones[ray * RAY_STEP + RAY_LENGTH];
-    const uint pixel = pixels[ray < counted ? ray : counted - 1];
+    const float counts = ray < pixel_count ? 1.0f : 0.0f, length = cones[ray * RAY_STEP + RAY_LENGTH];
+    const uint pixel = pixels[ray < pixel_count ? ray : pixel_count - 1];
     __global const float *photo = photograph + pixel / width * stride + pixel % width, *t = edges + ray * (samples + 1);
     float grad_color[3], error = 0.0f;
     for (uint channel = 0; channel < 3; channel++) {
@@ -105,7 +105,7 @@ void composite_backward(
         grad_color[channel] = 2.0f * counts * scale * difference;
         error += difference * difference;
     }
-    if (ray < counted)
+    if (ray < pixel_count)
         errors[first_ray + ray] = error;
     float behind = 0.0f;  // sum of w_j g_j over the samples behind
     for (uint k = samples; k-- > 0;) {
@@ -120,7 +120,7 @@ void composite_backward(
             grad_densities[at + (1 + channel) * SAMPLES] = 0.0f;
         }
         grad_colors[at + 3 * SAMPLES] = 0.0f;
-        const float grad_depth = left[ray * samples + k] * grad_weight - behind;
+        const float grad_depth = transmittance[ray * samples + k] * grad_weight - behind;
         grad_densities[at] =
             flush_to_zero(grad_depth * (t[k + 1] - t[k]) * length * logistic(raw_densities[at] + DENSITY_BIAS));
         behind += weight * grad_weight;
@@ -131,11 +131,11 @@ void composite_backward(
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void place_colors(
     __global const float *restrict colors,  // [rays,3]
-    __global const uint *restrict pixels,    // [rays] row * width + column
-    __global float *restrict image,          // [3,rows,stride]
+    __global const uint *restrict pixels,   // [rays] row * width + column
+    __global float *restrict image,         // [3,rows,stride]
     const uint width,
     const uint stride,
-    const uint plane,                        // rows * stride
+    const uint plane,                       // rows * stride
     const uint rays)
 {
     const uint ray = get_global_id(0);

@@ -1,7 +1,7 @@
 /* Dense layers of a network, forward and backward, as matrix products on tiles of samples (layers.h):
  *
- *   forward   y = larger(b + W^T x, lowest)               lowest: 0 for a ReLU, -FLT_MAX for none
- *   backward  dL/dx = W dL/dy, 0 where x <= lowest        dL/dW = sum over samples of x dL/dy^T,  dL/db of dL/dy
+ *   forward   y = larger(b + W^T x, lower_bound)         lower_bound: 0 for a ReLU, -FLT_MAX for none
+ *   backward  dL/dx = W dL/dy, 0 where x <= lower_bound  dL/dW = sum over samples of x dL/dy^T,  dL/db of dL/dy
  *
  * A weight is at [input, output].  Each sum has a fixed order: over rows, or over the samples of CHUNK tiles and then
  * over chunks.  So there are no atomics, and results do not depend on the number of threads.  No local memory. */
@@ -20,7 +20,7 @@ void dense_forward(
     const uint input_count,
     const uint output_rows,
     const uint output_count,
-    const float lowest,
+    const float lower_bound,
     const uint count)                           // items: T * COLUMNS * output_count / BLOCK
 {
     const uint i = get_global_id(0);
@@ -39,17 +39,17 @@ void dense_forward(
     __global float *block = outputs + (tile * output_rows + output) * SAMPLES + column;
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++)
-            VSTORE(larger(sums[k * BLOCK + v], (VF)(lowest)), block + k * SAMPLES + v * COLUMNS * LANES);
+            VSTORE(larger(sums[k * BLOCK + v], (VF)(lower_bound)), block + k * SAMPLES + v * COLUMNS * LANES);
 }
 
 /* Gradients of derived_count inputs of a layer, in the rows of `inputs` from first_input on, whose weights start at
- * first_parameter.  kept: 1 to add to the existing values, before the gate; else 0.
+ * first_parameter.  accumulate: 1 to add to the existing values, before the gate; else 0.
  * One item = BLOCK inputs of BLOCK vectors of samples. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_backward(
     __global const float *restrict grad_outputs,  // [T,output_rows,SAMPLES]
     __global const float *restrict parameters,    // [P] at first_parameter: weights [derived_count,output_count]
-    __global const float *restrict inputs,      // [T,input_rows,SAMPLES]
+    __global const float *restrict inputs,        // [T,input_rows,SAMPLES]
     __global float *restrict grad_inputs,         // [T,derived_count,SAMPLES]
     const uint first_parameter,
     const uint input_rows,
@@ -57,9 +57,9 @@ void dense_backward(
     const uint derived_count,
     const uint output_rows,
     const uint output_count,
-    const float lowest,                         // inputs up to it have no gradient
-    const uint kept,
-    const uint count)                           // items: T * COLUMNS * derived_count / BLOCK
+    const float lower_bound,                      // inputs up to it have no gradient
+    const uint accumulate,
+    const uint count)                             // items: T * COLUMNS * derived_count / BLOCK
 {
     const uint i = get_global_id(0);
     if (i >= count)
@@ -71,13 +71,13 @@ void dense_backward(
     VF sums[BLOCK * BLOCK];
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++)
-            sums[k * BLOCK + v] = kept ? VLOAD(block + k * SAMPLES + v * COLUMNS * LANES) : (VF)(0.0f);
+            sums[k * BLOCK + v] = accumulate ? VLOAD(block + k * SAMPLES + v * COLUMNS * LANES) : (VF)(0.0f);
     multiply_rows(sums, grad_outputs + tile * output_rows * SAMPLES + column,
                   parameters + first_parameter + input * output_count, output_count, 1, output_count);
     for (uint k = 0; k < BLOCK; k++)
         for (uint v = 0; v < BLOCK; v++) {
             const uint at = k * SAMPLES + v * COLUMNS * LANES;
-            VSTORE((VLOAD(gate + at) <= lowest ? (VF)(0.0f) : sums[k * BLOCK + v]), block + at);
+            VSTORE((VLOAD(gate + at) <= lower_bound ? (VF)(0.0f) : sums[k * BLOCK + v]), block + at);
         }
 }
 

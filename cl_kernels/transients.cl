@@ -1,9 +1,10 @@
 /* Transients, objects in a photograph that are not part of the scene: residuals, their histogram, and the mask of
  * pixels without large residuals.
  *
- * A residual is the mean over the channels of |image - photograph|; -1 in pixels that do not count.  Bins are eighths
- * of octaves from 2^-12 on: the upper bits of the float itself.  Planes are [channels,H',W'] with H', W' whole tiles,
- * zero outside the image.  Counters are integer atomics, so counts do not depend on the order of the items. */
+ * A residual is the mean over the channels of |image - photograph|; -1 outside the image and in masked pixels.  A bin
+ * is an eighth of an octave, from 2^-12 on: its index is the upper bits of the float itself.  Planes are
+ * [channels,H',W'] with H', W' whole tiles, zero outside the image.  Counters are integer atomics, so counts do not
+ * depend on the order of the items. */
 #include "planes.h"
 
 #define BINS 96        // twelve octaves, up to 1; the first and the last also count values beyond
@@ -46,8 +47,8 @@ void measure_residuals(
             atomic_add(numbers + k, row_counts[k]);
 }
 
-/* 1 in pixels whose residual is below a threshold, or around which at least 50 % of the residuals in a box are below
- * it; else 0.  One item = one pixel; dimension 1 is the row. */
+/* Write the mask: 1 in pixels whose residual is below a threshold, or where at least half of the residuals in the box
+ * around the pixel are below it; else 0.  One item = one pixel; dimension 1 is the row. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mask_transients(
     __global const float *restrict residuals,  // [H',stride]

@@ -18,8 +18,9 @@ class PruneAtRandom(Rule):
 
     def mark(self, edit: Edit) -> None:
         opacity = 1 / (1 + np.exp(-edit.gaussians.get("logit_opacity")[:, 0]))
-        is_faint = opacity < edit.at(self.opacity_below)
-        edit.choose(is_faint & (edit.random().random(len(is_faint)) < edit.at(self.fraction)), copies=0, old_rows=0)
+        is_faint = opacity < edit.evaluate(self.opacity_below)
+        is_drawn = edit.random().random(len(is_faint)) < edit.evaluate(self.fraction)
+        edit.choose(is_faint & is_drawn, copies=0, old_rows=0)
 
 
 class CapSize(Scheduled):

@@ -98,7 +98,7 @@ class Edit:
             raise ConfigError("a rule needs training photos, but there are none; remove the rule")
         return self._survey
 
-    def at(self, schedule: Schedule) -> float:
+    def evaluate(self, schedule: Schedule) -> float:
         """Return the value of a schedule at the step of the edit."""
         return at_step(schedule, self.step)
 
@@ -156,7 +156,7 @@ class Edit:
         if isinstance(threshold, PixelQuantile):
             return self.scene_scale.texture_quantile(threshold.quantile)
         if not isinstance(threshold, Quantile):
-            return self.at(threshold)
+            return self.evaluate(threshold)
         mean = self.stats.mean(statistic)[self.gaussians.get(SEEN)[:, 0] > 0]
         return max(float(np.quantile(mean, threshold.quantile)), MIN_BOUND) if len(mean) else MIN_BOUND
 

@@ -124,8 +124,8 @@ class SampledPruning(Rule):
         gaussians = edit.gaussians
         opacity = 1 / inverse_opacities(gaussians.get("logit_opacity")[:, 0])
         size = np.exp(gaussians.get("log_scales").max(axis=1)) * edit.shrink.get()
-        is_large = size > edit.at(self.size_above) * edit.scene_scale.extent
-        candidates = ((opacity < edit.at(self.opacity_below)) | is_large) & (edit.row_counts() > 0)
+        is_large = size > edit.evaluate(self.size_above) * edit.scene_scale.extent
+        candidates = ((opacity < edit.evaluate(self.opacity_below)) | is_large) & (edit.row_counts() > 0)
         order = sampling_order(candidates, self.weights(edit), edit.random())
         mask = np.zeros_like(candidates)
         mask[order[: int(self.share * len(order))]] = True

@@ -43,7 +43,7 @@ class Grow(Rule):
 
     def condition(self, edit: Edit) -> dict[str, Any]:
         """Return arguments of `Edit.mark`: the condition of the rule, and whether children share the opacity."""
-        threshold = edit.at(self.gradient_above)
+        threshold = edit.evaluate(self.gradient_above)
         if self.as_many_as:
             threshold = edit.matching_threshold(self.statistic, self.as_many_as, threshold)
         return {"statistic": self.statistic, "gradient_above": threshold, "shared": self.opacity == "shared"}
@@ -59,7 +59,7 @@ class Clone(Grow):
     """Size up to which a Gaussian is cloned: largest standard deviation as a fraction of the scene extent."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=2, old_rows=1, size_below=edit.at(self.size_below), **self.condition(edit))
+        edit.mark(copies=2, old_rows=1, size_below=edit.evaluate(self.size_below), **self.condition(edit))
 
 
 class SplitLarge(Grow):
@@ -80,7 +80,7 @@ class SplitLarge(Grow):
             copies=self.children,
             old_rows=0,
             shrink=1.0 / self.shrink,
-            size_above=edit.at(self.size_above),
+            size_above=edit.evaluate(self.size_above),
             **self.condition(edit),
         )
 
@@ -96,7 +96,7 @@ class PruneFaint(Rule):
     """Opacity below which a Gaussian is removed."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=0, old_rows=0, opacity_below=edit.at(self.opacity_below))
+        edit.mark(copies=0, old_rows=0, opacity_below=edit.evaluate(self.opacity_below))
 
 
 class PruneLarge(Rule):
@@ -110,4 +110,4 @@ class PruneLarge(Rule):
     """Size above which a Gaussian is removed: largest standard deviation as a fraction of the scene extent."""
 
     def mark(self, edit: Edit) -> None:
-        edit.mark(copies=0, old_rows=0, size_above=edit.at(self.size_above))
+        edit.mark(copies=0, old_rows=0, size_above=edit.evaluate(self.size_above))

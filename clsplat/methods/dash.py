@@ -51,6 +51,6 @@ class Momentum(Budget):
         final = self.gaussians or initial + momentum
         is_last, divisor = context.remaining_edits == 1, context.divisor ** (2 - context.progress)
         target = final if is_last else initial + (final - initial) / divisor
-        candidates = int((edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)).sum())
+        candidates = int((edit.stats.mean("screen_grad") >= edit.evaluate(self.gradient_above)).sum())
         state["momentum/sum"] = max(momentum, float(int(self.keep * momentum + min(self.max_added, candidates))))
         return min(max(count, int(target)), int(count * (1 + self.growth)))

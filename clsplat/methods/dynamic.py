@@ -31,4 +31,4 @@ class PruneInvisible(Rule):
         upper = np.searchsorted(timestamps, centers).clip(1, max(len(timestamps) - 1, 1))
         presences = [presence(motion, timestamps[np.minimum(i, len(timestamps) - 1)]) for i in (upper - 1, upper)]
         opacity = opacities(gaussians.get("logit_opacity")[:, 0]) * np.maximum(*presences)
-        edit.choose(opacity < edit.at(self.opacity_below), copies=0, old_rows=0)
+        edit.choose(opacity < edit.evaluate(self.opacity_below), copies=0, old_rows=0)

@@ -73,7 +73,7 @@ class PruneRedundant(Rule):
         survey, gaussians = edit.survey, edit.gaussians
         order = np.argsort(survey.compute_once(sampled_weights).total, kind="stable")
         views = survey.sample_views(self.views)
-        limit = (1 + edit.at(self.error_rise)) * squared_error(survey, views)
+        limit = (1 + edit.evaluate(self.error_rise)) * squared_error(survey, views)
 
         def is_allowed(count: int) -> bool:
             return evaluate_without(gaussians, order[:count], lambda: squared_error(survey, views)) <= limit

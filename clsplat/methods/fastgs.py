@@ -62,7 +62,7 @@ class RevertGrowth(WrongPixelsRule):
     """Mean number of wrong pixels per view, rounded down, above which a Gaussian may grow."""
 
     def mark(self, edit: Edit) -> None:
-        edit.undo_growth(self.count_wrong_pixels(edit).pixels <= edit.at(self.pixels_above))
+        edit.undo_growth(self.count_wrong_pixels(edit).pixels <= edit.evaluate(self.pixels_above))
 
 
 class PruneSampled(SampledPruning, WrongPixelsRule):

@@ -48,19 +48,20 @@ class CloneDense(Rule):
         gaussians = edit.gaussians
         means = gaussians.get("means").astype(np.float64)
         scales = np.exp(gaussians.get("log_scales").astype(np.float64))
-        has_gradient = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
+        has_gradient = edit.stats.mean("screen_grad") >= edit.evaluate(self.gradient_above)
         cell = grid_cells(means, self.cells)
         counts = np.bincount(cell[has_gradient & (cell >= 0)], minlength=self.cells**3)
         order = np.argsort(-counts, kind="stable")
         densest, sparsest = order[: self.extremes], order[-self.extremes :]
-        if counts[densest].sum() < edit.at(self.ratio_above) * max(counts[sparsest].sum(), 1):
+        if counts[densest].sum() < edit.evaluate(self.ratio_above) * max(counts[sparsest].sum(), 1):
             return
-        is_small = scales.max(axis=1, initial=0) <= edit.at(self.size_below) * edit.scene_scale.extent
+        is_small = scales.max(axis=1, initial=0) <= edit.evaluate(self.size_below) * edit.scene_scale.extent
         is_copied = has_gradient & is_small & np.isin(cell, densest) & (edit.row_counts() == 1)
         rows = np.flatnonzero(is_copied)
         quats = gaussians.get("quats")[rows].astype(np.float64)
         axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T) * scales[rows, None, :]
-        offset = edit.at(self.jitter) * np.einsum("nij,nj->ni", axes, edit.random().standard_normal((len(rows), 3)))
+        noise = edit.random().standard_normal((len(rows), 3))
+        offset = edit.evaluate(self.jitter) * np.einsum("nij,nj->ni", axes, noise)
         edit.choose(is_copied, copies=3, old_rows=1)
         edit.set_children("means", rows, np.stack([means[rows], means[rows], means[rows] + offset], axis=1))
 

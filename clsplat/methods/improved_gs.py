@@ -68,7 +68,7 @@ class SplitLongAxis(Rule):
 
     def mark(self, edit: Edit) -> None:
         gaussians = edit.gaussians
-        is_split = (edit.stats.mean("screen_grad_abs") >= edit.at(self.gradient_above)) & (edit.row_counts() == 1)
+        is_split = (edit.stats.mean("screen_grad_abs") >= edit.evaluate(self.gradient_above)) & (edit.row_counts() == 1)
         if edit.room is not None and edit.room < is_split.sum():
             order = sampling_order(is_split, edit.survey.compute_once(edge_scores, self.views), edit.random())
             is_split = np.isin(np.arange(gaussians.count), order[: max(edit.room, 0)])
@@ -79,7 +79,7 @@ class SplitLongAxis(Rule):
         longest = log_scales.argmax(axis=1)
         index = np.arange(len(rows)), longest
         axes = rotation_matrix(*(quats / np.linalg.norm(quats, axis=1, keepdims=True)).T)[index[0], :, longest]
-        offset = edit.at(self.distance) * np.exp(log_scales[index])[:, None] * axes
+        offset = edit.evaluate(self.distance) * np.exp(log_scales[index])[:, None] * axes
         log_scales += math.log(self.other_axes)
         log_scales[index] += math.log(self.long_axis / self.other_axes)
         logits = math.log(self.opacity) - np.log1p(np.exp(-logits) - self.opacity)  # logit of a fraction of the opacity

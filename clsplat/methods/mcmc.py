@@ -35,7 +35,7 @@ class Relocate(Rule):
         gaussians, rows = edit.gaussians, edit.row_counts()
         logit, log_scales = (gaussians.get(name).astype(np.float64) for name in ("logit_opacity", "log_scales"))
         opacity = np.minimum(1 / (1 + np.exp(-logit[:, 0])), 1 - 1e-7)
-        min_opacity = edit.at(self.opacity_below)
+        min_opacity = edit.evaluate(self.opacity_below)
         is_faint = opacity < min_opacity
         weights = np.where(is_faint | (rows != 1), 0, opacity * WEIGHT_STEPS).astype(np.uint64)
         if not weights.any():

@@ -100,7 +100,7 @@ class SplitTextured(Subdivide):
         texture, gradient = edit.stats.mean(self.texture), edit.stats.mean("screen_grad")
         threshold = edit.threshold(self.texture, self.texture_above)
         is_visible = edit.gaussians.get(SEEN)[:, 0] > 0
-        candidates = is_visible & (texture >= threshold) & (gradient >= edit.at(self.gradient_above))
+        candidates = is_visible & (texture >= threshold) & (gradient >= edit.evaluate(self.gradient_above))
         self.subdivide(edit, candidates, texture)
 
 
@@ -133,7 +133,7 @@ class SplitOversized(Subdivide):
         elif isinstance(self.rms_above, Quantile):
             bound = np.full_like(rms, np.quantile(rms, self.rms_above.quantile) if len(rms) else 0.0)
         else:
-            bound = np.full_like(rms, edit.at(self.rms_above) * edit.scene_scale.extent)
+            bound = np.full_like(rms, edit.evaluate(self.rms_above) * edit.scene_scale.extent)
         self.subdivide(edit, rms > bound, rms / np.maximum(bound, 1e-30))
 
 
@@ -207,9 +207,9 @@ class MergeNeighbors(Rule):
         distance, nearest = distances[rows, column], neighbors[rows, column]
         is_mutual = (nearest[nearest] == rows) & (rows < nearest)
         size = np.exp(tables["log_scales"].mean(axis=1))
-        is_close = distance < edit.at(self.distance_below) * (size + size[nearest])
+        is_close = distance < edit.evaluate(self.distance_below) * (size + size[nearest])
         color = SH_C0 * np.abs(tables["sh_base"] - tables["sh_base"][nearest]).max(axis=1)
-        first = rows[is_mutual & is_close & (color < edit.at(self.color_below))]
+        first = rows[is_mutual & is_close & (color < edit.evaluate(self.color_below))]
         second = nearest[first]
         is_heavier = mass[first] >= mass[second]
         return np.where(is_heavier, first, second), np.where(is_heavier, second, first)

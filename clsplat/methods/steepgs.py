@@ -79,11 +79,11 @@ class SplitSteepest(Rule):
 
     def mark(self, edit: Edit) -> None:
         gaussians, extent = edit.gaussians, edit.scene_scale.extent
-        has_gradient = edit.stats.mean("screen_grad") >= edit.at(self.gradient_above)
+        has_gradient = edit.stats.mean("screen_grad") >= edit.evaluate(self.gradient_above)
         rows = np.flatnonzero(has_gradient & (edit.row_counts() == 1))
         values, axes = smallest_eigenvectors(edit.stats.means("splitting")[rows].astype(np.float64) * extent**2)
         room = len(rows) if edit.room is None else max(edit.room, 0)
-        mask = select_largest(-values, room, values < edit.at(self.eigenvalue_below))
+        mask = select_largest(-values, room, values < edit.evaluate(self.eigenvalue_below))
         rows, axes = rows[mask], axes[mask]
         tables = {
             name: gaussians.get(name)[rows].astype(np.float64)
@@ -91,7 +91,7 @@ class SplitSteepest(Rule):
         }
         covariance = covariance_matrices(tables["quats"], tables["log_scales"])
         deviation = np.sqrt(np.einsum("ni,nij,nj->n", axes, covariance, axes))
-        offset = edit.at(self.distance) * deviation[:, None] * axes
+        offset = edit.evaluate(self.distance) * deviation[:, None] * axes
         is_split = np.zeros(gaussians.count, bool)
         is_split[rows] = True
         edit.choose(is_split, copies=2, old_rows=0, shrink=1 / self.shrink)

@@ -135,7 +135,7 @@ class RayRenderer:
             edges=level.edges,
             background=self.background,
             weights=level.weights,
-            left=level.transmittance,
+            transmittance=level.transmittance,
             colors=level.colors,
             photograph=target.photograph,
             pixels=rays.pixels,
@@ -148,7 +148,7 @@ class RayRenderer:
             stride=camera.stride,
             plane=camera.rows * camera.stride,
             samples=level.samples,
-            counted=rays.ray_count,
+            pixel_count=rays.ray_count,
             rays=rays.count,
         )
         grad_grid = self.network.backward(parameters, grad_colors, grad_densities, gradient)
@@ -215,7 +215,7 @@ class RayRenderer:
             edges=edges,
             background=self.background,
             weights=weights,
-            left=transmittances,
+            transmittance=transmittances,
             colors=colors,
             samples=samples,
             rays=rays.count,

@@ -143,7 +143,7 @@ class Network:
             input_count=layer.rows,
             output_rows=outputs.shape[1],
             output_count=layer.columns,
-            lowest=lower_bound,
+            lower_bound=lower_bound,
             count=count,
         )
 
@@ -173,8 +173,8 @@ class Network:
             derived_count=grad_rows,
             output_rows=output_rows,
             output_count=layer.columns,
-            lowest=lower_bound,
-            kept=add,
+            lower_bound=lower_bound,
+            accumulate=add,
             count=count,
         )
 

@@ -128,7 +128,7 @@ class Densify(Scheduled):
         if self._has_growth_ended(run):
             yield 0
         if self.max_gaussians is not None:
-            yield int(edit.at(self.max_gaussians)) + self._count_outside(run, edit)
+            yield int(edit.evaluate(self.max_gaussians)) + self._count_outside(run, edit)
         if self.budget and self.every and self.stop:
             edits = len(fire_steps(self.every, run.step - 1, self.stop))
             context = BudgetContext(run.step / self.stop, edits, run.image_downscale)
