@@ -245,8 +245,8 @@ void spawn_children(
 }
 
 /* Opacities of rows that together transmit as much light as their Gaussian did: 1 - o' = (1 - o)^(1/n) (Rota Bulo et
- * al.  2024, "Revising Densification in Gaussian Splatting").  In logits, with x = log(1 + e^l) / n: l' = log(e^x - 1).
- * */
+ * al. 2024, "Revising Densification in Gaussian Splatting").  In logits, with x = log(1 + e^l) / n:
+ * l' = log(e^x - 1). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void share_opacity(
     __global const uint *restrict source,    // [M] row before the edit

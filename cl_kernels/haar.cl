@@ -93,7 +93,7 @@ void haar_backward(
             const float2 upper = (float2)(gradient[at], gradient[at + 1]);
             const float2 lower = (float2)(gradient[at + stride], gradient[at + stride + 1]);
             const float2 low = upper + lower, high = upper - lower;
-            const float2 before = low + u * high, after = low + v * high;  // 2 d/d(once), its columns
+            const float2 before = low + u * high, after = low + v * high;  // columns of 2 dL/d(once)
             const float2 first_high = (float2)(before.x - before.y, after.x - after.y);
             total_u += high * once.xz + 0.5f * first_high * block.xz;
             total_v += high * once.yw + 0.5f * first_high * block.yw;

@@ -94,8 +94,8 @@ static inline VI touches_tile(const footprint_t *f, const VF column, const VF ro
 
 static inline VI is_large(const footprint_t *f) { return f->columns * f->rows > (float)BOX_TILES_MAX; }
 
-/* The number of tiles that each splat touches, and their mask; 0 if the rectangle has more tiles than a mask has bits.
- * */
+/* The number of tiles that each splat touches, and their mask; both are 0 if the rectangle has more tiles than a mask
+ * has bits. */
 static inline VI count_tiles(const footprint_t *f, VI *mask)
 {
     const VI columns = to_VI(f->columns), zero = (VI)(0);

@@ -30,7 +30,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 Floats = NDArray[np.float32]
 Color = float | Sequence[float]
 _OPEN_LOCK = threading.Lock()
-GEOMETRY = 6  # number of pixel sums for the geometry; those for the color follow (cl_kernels/splat.h)
+GEOMETRY_SUMS = 6  # number of pixel sums for the geometry; those for the color follow (cl_kernels/splat.h)
 
 
 def open_checked(device: str | Device | None, schedule: Schedule = "auto", sort: Sort = "auto") -> Device:
@@ -192,13 +192,13 @@ class Renderer:
         if alpha is not None or depth is not None:
             frame = self._forward(model, camera, np.zeros(3, np.float32), "depth")
             geometry = self._pixel_sums(model, frame, _depth_planes(frame, alpha, depth)).get()
-            grad_depth += geometry[GEOMETRY, :count]  # the first color of that frame is the depth
+            grad_depth += geometry[GEOMETRY_SUMS, :count]  # the first color of that frame is the depth
         frame = self._forward(model, camera, result.background)
         planes = np.zeros((*size, 3), np.float32) if image is None else _check_shape("image", image, (*size, 3))
         pixel_sums = self._pixel_sums(model, frame, planes)
         if geometry is not None:
             total_sums = pixel_sums.get()
-            total_sums[:GEOMETRY] += geometry[:GEOMETRY]
+            total_sums[:GEOMETRY_SUMS] += geometry[:GEOMETRY_SUMS]
             pixel_sums.set(total_sums)
         pose_sums = pose_gradient(self.rasterizer.workspace, model, frame, pixel_sums)
         gradients = self.rasterizer.gradients(model, frame, pixel_sums)

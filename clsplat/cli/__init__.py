@@ -54,7 +54,7 @@ def _report(error: BaseException, is_debugging: bool) -> int:
     else:
         failure = as_clsplat_error(error)
         message, code = one_line(failure) or type(failure).__name__, failure.exit_code
-    terminal.ERRORS.print(message if code == Interrupted.exit_code else f"error: {message}", markup=False)
+    terminal.STDERR_CONSOLE.print(message if code == Interrupted.exit_code else f"error: {message}", markup=False)
     return code
 
 

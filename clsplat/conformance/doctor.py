@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from clsplat.conformance.check import Deviation
-from clsplat.conformance.checks import KERNELS, SPEED, TILED
+from clsplat.conformance.checks import KERNELS, SPEED_CHECKS, TILED
 from clsplat.conformance.host import describe_host
 from clsplat.conformance.quick import forget, remember
 from clsplat.conformance.supervision import CheckResult, run_checks
@@ -221,7 +221,7 @@ def examine(device: str | Device | None = None) -> DeviceReport:
             remember(info, schedule)
         else:
             forget(info, schedule)
-    for result in run_checks(info, default, SPEED):
+    for result in run_checks(info, default, SPEED_CHECKS):
         report.once.append(result)
         LOG.info("%s", progress_line("", result))
     report.seconds = time.perf_counter() - start_time

@@ -47,10 +47,11 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
     sorts = SORTS if uses_bitonic else SORTS[:1]
     if all(_record_file(info, schedule, name).exists() for name in sorts):
         return
-    from clsplat.conformance.checks import BITONIC, ESSENTIAL  # slow to import, and not needed for a verified device
+    # slow to import, and not needed for a verified device
+    from clsplat.conformance.checks import BITONIC, ESSENTIAL_CHECKS
 
     LOG.info("checking %s; this takes a few seconds, or longer if its compiler is slow", info.name)
-    for result in run_checks(info, schedule, [*ESSENTIAL, *(BITONIC if uses_bitonic else [])], TIMEOUT_S):
+    for result in run_checks(info, schedule, [*ESSENTIAL_CHECKS, *(BITONIC if uses_bitonic else [])], TIMEOUT_S):
         if result.out_of_memory:
             raise MemoryLimitError(f"{device.label}: {result.failures[0]}; close other programs that use its memory")
         if result.damaged_cache:

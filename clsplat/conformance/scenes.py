@@ -17,7 +17,7 @@ from clsplat.render.camera import DeviceCamera, upload_camera
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
-SHARP = ref.Thresholds()
+SHARP_THRESHOLDS = ref.Thresholds()
 POSE = np.array([[0.98, 0.05, -0.19, 0.1], [-0.03, 0.995, 0.1, -0.05], [0.19, -0.09, 0.977, 0.3]])
 
 
@@ -70,7 +70,7 @@ class Case:
         settings = {"near": self.near, "variance": self.variance, "compensate": self.compensate}
         return settings | {"pixel_box": self.pixel_box}
 
-    def project(self, thresholds: ref.Thresholds = SHARP) -> ref.Splats:
+    def project(self, thresholds: ref.Thresholds = SHARP_THRESHOLDS) -> ref.Splats:
         settings = self.projection_settings()
         splats = ref.project(self.gaussians(), self.camera(), self.degree, **settings, thresholds=thresholds)
         if self.dropout:

@@ -251,7 +251,7 @@ PREPARED = "prepared"
 COMPARISON = "compare.html"
 STORE = "store"  # results of the cells of a matrix
 MODULE_FILE_PREFIX = "view_"  # side files of training modules
-RESERVED = frozenset(
+RESERVED_NAMES = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, PREPARE_SUMMARY, INPUTS, CHECKSUMS, LOCK),
         *(CHECKPOINTS, UNDISTORTED, PREPARED, COMPARISON, STORE, "cameras.json"),
@@ -292,7 +292,7 @@ def invalid_output_reason(text: str) -> str | None:
     parts = PureWindowsPath(text).parts
     if not is_inside(text):
         return "it is outside of the run folder"
-    if parts[0].casefold() in RESERVED or parts[0].casefold().startswith(MODULE_FILE_PREFIX):
+    if parts[0].casefold() in RESERVED_NAMES or parts[0].casefold().startswith(MODULE_FILE_PREFIX):
         return f"'{parts[0]}' is written by the run itself"
     if any(part.startswith(".") for part in parts):
         return "names that start with a dot are reserved for temporary files"
@@ -325,4 +325,4 @@ def _is_run_file(run: Path, path: Path) -> bool:
         checksums = read_json(run / CHECKSUMS)
     except DataError:  # the run has not ended, or it is a matrix
         return True
-    return not isinstance(checksums, dict) or name in checksums or name in RESERVED
+    return not isinstance(checksums, dict) or name in checksums or name in RESERVED_NAMES

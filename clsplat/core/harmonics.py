@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 DIRECTIONS = 64  # samples: enough to fit the 7 functions of a band and, with the opposite directions, all products
 BAND_0 = 0.28209479177387814
-ROWS = 4096  # Gaussians per block, to limit temporary memory
+BLOCK_ROWS = 4096  # Gaussians per block, to limit temporary memory
 Floats = NDArray[np.float64]
-DIGITS = 6  # decimals of means; further digits differ between processors
+MEAN_DECIMALS = 6  # decimals of means; further digits differ between processors
 
 
 def basis(directions: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -43,7 +43,7 @@ def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
     moments = form * (count / (4 * np.pi) / np.trace(form))  # |Y|² = K / 4 pi in every direction
     mean = moments[pairs] @ product_coefficients
     norm2 = mean @ np.linalg.solve(moments, mean)  # at most 1 for a distribution; noise in `form` can exceed it
-    return np.asarray(np.round(mean / np.sqrt(max(norm2, 1.0)), DIGITS))
+    return np.asarray(np.round(mean / np.sqrt(max(norm2, 1.0)), MEAN_DECIMALS))
 
 
 def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -75,8 +75,8 @@ def map_colors(coefficients: NDArray[np.floating], curve: Callable[[Floats], Flo
     values = basis(np.concatenate([directions, -directions]))[:, : coefficients.shape[1] - 1]
     values = np.concatenate([np.full((len(values), 1), BAND_0), values], axis=1)
     pseudo_inverse, result = np.linalg.pinv(values), np.empty(coefficients.shape)
-    for first in range(0, len(coefficients), ROWS):
-        rows = slice(first, first + ROWS)
+    for first in range(0, len(coefficients), BLOCK_ROWS):
+        rows = slice(first, first + BLOCK_ROWS)
         result[rows] = pseudo_inverse @ (curve(values @ coefficients[rows].astype(np.float64) + 0.5) - 0.5)
     return result
 

@@ -260,7 +260,7 @@ def process_limit(name: Literal["RLIMIT_AS", "RLIMIT_FSIZE"]) -> int | None:
     return None if limit == resource.RLIM_INFINITY else limit
 
 
-CONTAINER = Path("/sys/fs/cgroup")
+CGROUP_FOLDER = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int | None:
@@ -270,9 +270,8 @@ def available_memory() -> int | None:
         lines = Path("/proc/meminfo").read_text("utf-8").splitlines()
         limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
     with suppress(OSError, ValueError):  # not in a container, or no limit ("max")
-        limits.append(
-            int((CONTAINER / "memory.max").read_text("utf-8")) - int((CONTAINER / "memory.current").read_text("utf-8"))
-        )
+        limit, used = (int((CGROUP_FOLDER / f"memory.{name}").read_text("utf-8")) for name in ("max", "current"))
+        limits.append(limit - used)
     if not limits and hasattr(os, "sysconf") and "SC_AVPHYS_PAGES" in os.sysconf_names:
         limits.append(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     return max(0, min(limits)) if limits else None

@@ -22,7 +22,7 @@ FILE_TYPES = {
     stat.S_IFBLK: "a device",
 }
 
-STARTS = (  # the first bytes of unexpected content, its description, and a remedy
+CONTENT_STARTS = (  # the first bytes of unexpected content, its description, and a remedy
     (b"version https://git-lfs", "a Git LFS pointer", "fetch the content with `git lfs pull`"),
     (b"<!doctype", "a web page", "download the file itself"),
     (b"<html", "a web page", "download the file itself"),
@@ -34,7 +34,7 @@ def require_content(path: Path, data: bytes, error_type: type[ClsplatError] = Da
     """Raise `error_type` if a file that starts with `data` is empty or is the result of a failed download."""
     if not data:
         raise error_type(f"{path}: the file is empty; copy or export it again")
-    for start, content, remedy in STARTS:
+    for start, content, remedy in CONTENT_STARTS:
         if data.lstrip()[: len(start)].lower() == start:
             raise error_type(f"{path}: the file is {content}; {remedy}")
 

@@ -14,7 +14,7 @@ from typing import Any, NoReturn, TextIO
 from clsplat.core.errors import OutputError
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # SIGBREAK: Ctrl-Break on Windows, or a closed window
-GRACE = 60.0  # seconds to stop after stdin has closed, before the process exits
+EXIT_DELAY_S = 60.0  # seconds to stop after stdin has closed, before the process exits
 IMPORT_SECONDS = 10.0  # longest wait for an import; the import of a plug-in may never end
 
 
@@ -61,7 +61,7 @@ def _watch_stdin() -> None:
         while os.read(0, 4096):
             pass
     _thread.interrupt_main(signal.SIGTERM)
-    time.sleep(GRACE)
+    time.sleep(EXIT_DELAY_S)
     os._exit(130)
 
 

@@ -23,7 +23,7 @@ from clsplat.core.resources import full_version
 
 LOG = logging.getLogger("clsplat")
 CONSOLE = Console(file=signals.STDOUT, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
-ERRORS = Console(file=signals.STDERR, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
+STDERR_CONSOLE = Console(file=signals.STDERR, highlight=False, soft_wrap=True)  # type: ignore[arg-type]
 _bars: list[Live] = []  # currently visible
 
 
@@ -43,7 +43,7 @@ class _TerminalHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         is_warning = record.levelno >= logging.WARNING
-        console = ERRORS if is_warning else self.console
+        console = STDERR_CONSOLE if is_warning else self.console
         if _bars and console.is_terminal:  # a line on another console would run into the bar
             console = CONSOLE
         console.print(("warning: " if is_warning else "") + record.getMessage(), markup=False)
@@ -62,7 +62,7 @@ def keep_stdout_for_json() -> None:
     """Log to stderr from now on, so that stdout contains only JSON."""
     for handler in LOG.handlers:
         if isinstance(handler, _TerminalHandler):
-            handler.console = ERRORS
+            handler.console = STDERR_CONSOLE
 
 
 def print_message(text: str) -> None:

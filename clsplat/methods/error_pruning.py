@@ -19,8 +19,8 @@ from clsplat.opencl.device import Array
 from clsplat.render.painter import crop
 from clsplat.scene.view import View
 
-HIDDEN = -40.0  # logit of an invisible opacity
-RESOLUTION = 256  # the number of Gaussians to prune is accurate to 1/256 of all Gaussians
+HIDDEN_LOGIT = -40.0  # logit of an invisible opacity
+COUNT_RESOLUTION = 256  # the number of Gaussians to prune is accurate to 1/256 of all Gaussians
 
 
 def squared_error(survey: Survey, views: list[View]) -> float:
@@ -36,7 +36,7 @@ def evaluate_without(gaussians: Gaussians, rows: NDArray[np.intp], function: Cal
     """Return `function()` while the Gaussians in `rows` are invisible; restore them afterwards."""
     logits = gaussians.get("logit_opacity")
     hidden_logits = logits.copy()
-    hidden_logits[rows] = HIDDEN
+    hidden_logits[rows] = HIDDEN_LOGIT
     gaussians.set("logit_opacity", hidden_logits)
     try:
         return function()
@@ -45,8 +45,8 @@ def evaluate_without(gaussians: Gaussians, rows: NDArray[np.intp], function: Cal
 
 
 def find_largest_allowed(is_allowed: Callable[[int], bool], count: int) -> int:
-    """Return the largest allowed number from 0 to `count`, by bisection, accurate to `count` / RESOLUTION."""
-    low, high, step = 0, count + 1, max(1, count // RESOLUTION)
+    """Return the largest allowed number from 0 to `count`, by bisection, accurate to `count` / COUNT_RESOLUTION."""
+    low, high, step = 0, count + 1, max(1, count // COUNT_RESOLUTION)
     while high - low > step:
         middle = (low + high) // 2
         low, high = (middle, high) if is_allowed(middle) else (low, middle)

@@ -11,7 +11,7 @@ from clsplat.core.schedule import NonNegative, Positive
 from clsplat.density.edit import Edit, Rule
 
 Floats = NDArray[np.float64]
-CENTRAL = (0.01, 0.99)  # the grid spans these quantiles of the means along each axis
+GRID_QUANTILES = (0.01, 0.99)  # the grid spans these quantiles of the means along each axis
 
 
 class CloneDense(Rule):
@@ -71,7 +71,7 @@ def grid_cells(means: Floats, cells: int) -> NDArray[np.int64]:
     is_finite = np.isfinite(means).all(axis=1)
     if not is_finite.any():
         return np.full(len(means), -1)
-    low, high = np.quantile(means[is_finite], CENTRAL, axis=0)
+    low, high = np.quantile(means[is_finite], GRID_QUANTILES, axis=0)
     is_inside = is_finite & np.all((means >= low) & (means <= high), axis=1)
     position = (np.where(is_inside[:, None], means, low) - low) / np.maximum(high - low, 1e-30) * cells
     index = np.minimum(position.astype(np.int64), cells - 1)

@@ -24,7 +24,7 @@ from clsplat.opencl.device import Array
 from clsplat.photos.photographs import unmasked_gradient
 from clsplat.render.filters import AT_REST
 
-BETA = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
+CHILD_COVARIANCE = 0.5  # Lee et al. 2025: a child's covariance is half its parent's
 
 
 class RenderedTexture(Statistic):
@@ -54,7 +54,7 @@ class Subdivide(Rule):
 
     children: Annotated[int, Field(ge=2, le=8)] = 2
     """Number of Gaussians that replace one."""
-    beta: Annotated[float, Field(gt=0, le=1)] = BETA
+    beta: Annotated[float, Field(gt=0, le=1)] = CHILD_COVARIANCE
     """A child's covariance divided by its parent's."""
     max_fraction: UnitInterval = 0.05
     """Largest fraction of all Gaussians that one edit splits, starting with the largest scores."""

@@ -21,7 +21,7 @@ from clsplat.losses.base import ViewGradients
 from clsplat.opencl.device import Array
 
 Floats = NDArray[np.float64]
-UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # column of each element of the symmetric matrix
+MATRIX_COLUMNS = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # column of each element of the symmetric matrix
 
 
 class Splitting(Statistic):
@@ -106,7 +106,7 @@ def smallest_eigenvectors(columns: Floats) -> tuple[Floats, Floats]:
     The component of the eigenvector with the largest magnitude is positive.  Rows that are not finite give 0.
     """
     is_finite = np.isfinite(columns).all(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(np.where(is_finite, columns, 0)[:, UPPER])
+    values, vectors = np.linalg.eigh(np.where(is_finite, columns, 0)[:, MATRIX_COLUMNS])
     axes = vectors[:, :, 0]
     dominant = np.take_along_axis(axes, np.abs(axes).argmax(axis=1)[:, None], axis=1)
     return values[:, 0], axes * np.where(dominant < 0, -1, 1)

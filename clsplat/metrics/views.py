@@ -241,7 +241,7 @@ def log_color_metrics(averages: dict[str, Any]) -> None:
 
 # PSNR of a dynamic scene, separately for timestamps of training views and others.
 
-HELD_OUT, OTHERS = "psnr_held_out_moments", "psnr_other_moments"
+HELD_OUT_PSNR, OTHER_PSNR = "psnr_held_out_moments", "psnr_other_moments"
 
 
 def psnr_by_time(
@@ -249,12 +249,13 @@ def psnr_by_time(
 ) -> dict[str, dict[str, float]]:
     """Return the PSNR of each view in dB, by view name and key.
 
-    The key is OTHERS if a training view has the same timestamp, otherwise HELD_OUT.  The result is empty if all views
-    have the same key, as in static scenes.
+    The key is OTHER_PSNR if a training view has the same timestamp, otherwise HELD_OUT_PSNR.  The result is empty if
+    all views have the same key, as in static scenes.
     """
     training_times, times = set(distinct_times(train_views)), {view.name: view.time for view in views}
-    keys = {name: OTHERS if time in training_times else HELD_OUT for name, time in times.items() if time is not None}
-    if not training_times or {keys.get(name) for name in psnr} != {HELD_OUT, OTHERS}:
+    known_times = {name: time for name, time in times.items() if time is not None}
+    keys = {name: OTHER_PSNR if time in training_times else HELD_OUT_PSNR for name, time in known_times.items()}
+    if not training_times or {keys.get(name) for name in psnr} != {HELD_OUT_PSNR, OTHER_PSNR}:
         return {}
     return {name: {keys[name]: value} for name, value in psnr.items()}
 

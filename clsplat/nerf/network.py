@@ -208,7 +208,7 @@ class Network:
 # The encodings of samples that the network reads, and the gradient of the grid.
 
 PLACE_ROWS = int(GRID["PLACE_ROWS"])
-PARTS = 64  # parts of all levels together, per compute unit of a GPU
+PARTS_PER_UNIT = 64  # parts of all levels together, per compute unit of a GPU
 
 
 @dataclass(frozen=True)
@@ -342,5 +342,5 @@ def parts_per_level(device: Device, levels: int) -> int:
 
     Each part reads all samples, so a CPU uses only enough parts to keep its cores busy.
     """
-    parts = 2 * device.info.units if int(device.tuning["TEAM"]) == 1 else PARTS * device.info.units
+    parts = 2 * device.info.units if int(device.tuning["TEAM"]) == 1 else PARTS_PER_UNIT * device.info.units
     return max(1, parts // levels)

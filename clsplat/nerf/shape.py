@@ -14,8 +14,8 @@ from clsplat.scene.viewpoint import BLENDER_DISTANCE, camera_distance
 
 GRID = constants("grid.cl")
 FEATURES = int(GRID["GRID_FEATURES"])
-FARTHEST = 1e6  # units of the field: the squared ratio of two depths stays within float32
-Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
+MAX_DISTANCE = 1e6  # units of the field: the squared ratio of two depths stays within float32
+Coordinate = Annotated[float, Field(ge=-MAX_DISTANCE, le=MAX_DISTANCE)]
 UNIT_MAX = 1e15  # largest unit in scene units, as values in a dataset; its inverse is the smallest
 UnitLength = Annotated[float, Field(ge=1 / UNIT_MAX, le=UNIT_MAX)]
 MAX_INITIAL = 1e-4  # largest initial value of an entry (Müller et al. 2022, section 4)
@@ -38,7 +38,7 @@ class GridShape(Settings):
     """Largest number of entries of a level, a power of 2; levels with more grid corners share entries by a hash."""
     corner: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] = Field([-1.5, -1.5, -1.5])
     """Corner of the cube with the smallest coordinates, in units of `unit`."""
-    side: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 3.0
+    side: Annotated[float, Field(ge=1e-6, le=MAX_DISTANCE)] = 3.0
     """Side of the cube, in units of `unit`."""
 
     @model_validator(mode="after")
@@ -125,9 +125,9 @@ class FieldShape(Settings):
     the point that they look at, divided by 4.03, so that it is 1 for the Blender scenes.  A run writes this length."""
     unit_auto: UnitLength | None = None
     """Written by a run: the length that `auto` chose.  If `unit` still equals it, other photos change both."""
-    near: Annotated[float, Field(ge=1e-6, le=FARTHEST)] = 2.0
+    near: Annotated[float, Field(ge=1e-6, le=MAX_DISTANCE)] = 2.0
     """Depth at which the samples of a ray start, in units of `unit`; 2 for the Blender scenes."""
-    far: Annotated[float, Field(gt=0, le=FARTHEST)] = 6.0
+    far: Annotated[float, Field(gt=0, le=MAX_DISTANCE)] = 6.0
     """Depth at which the samples of a ray end, in units of `unit`; 6 for the Blender scenes."""
     coarse_samples: Annotated[int, Field(ge=LANES_MAX, le=1024, multiple_of=LANES_MAX)] = 128
     """Samples per ray in the coarse level."""

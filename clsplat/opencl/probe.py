@@ -34,7 +34,7 @@ void vector_root(__global float *restrict squares)
 
 # Part of a clang warning: kernels are compiled without the vectors that the device reports, unlike the runtime's
 # library.  This happens with PoCL 3.0 on newer processors, where its compiler may also run for minutes.
-WITHOUT_VECTORS = "changes the ABI"
+VECTOR_WARNING = "changes the ABI"
 
 
 def main(platform: int, device: int) -> None:
@@ -51,7 +51,7 @@ def main(platform: int, device: int) -> None:
     reversed_values = cl.Buffer(context, flags.WRITE_ONLY, values.nbytes)
     lanes = 16 if cl_device.native_vector_width_float >= 16 else 8 if cl_device.native_vector_width_float >= 8 else 4
     program = cl.Program(context, SOURCE % {"lanes": lanes}).build(["-cl-std=CL1.2"])
-    if WITHOUT_VECTORS in program.get_build_info(cl_device, cl.program_build_info.LOG):
+    if VECTOR_WARNING in program.get_build_info(cl_device, cl.program_build_info.LOG):
         raise SystemExit("error: kernels are compiled without the processor's vector instructions")
     cl.Kernel(program, "reverse")(queue, (8,), (8,), source, reversed_values)
     result = np.empty_like(values)

@@ -25,7 +25,7 @@ PROBE = Path(__file__).with_name("probe.py")
 PROBE_MODULE = "clsplat.opencl.probe"
 PROBE_SECONDS = 120  # a first build may compile for many seconds on a slow machine
 
-INSTALL = (
+INSTALL_ADVICE = (
     "install a runtime: pip install '.[pocl]' or pip install '.[intel]' in a checkout, apt install pocl-opencl-icd, or "
     "your GPU's driver"
 )
@@ -67,7 +67,9 @@ def no_device_error(fault: str, advice: str = "") -> DeviceError | MemoryLimitEr
 def no_device_advice() -> str:
     """Return advice for a machine without devices: to correct environment variables, or to install a runtime."""
     variables = _user_variables()
-    return f"{variables} may hide the runtimes: correct or unset it; or {INSTALL}" if variables else INSTALL
+    if not variables:
+        return INSTALL_ADVICE
+    return f"{variables} may hide the runtimes: correct or unset it; or {INSTALL_ADVICE}"
 
 
 def _user_variables() -> str:

@@ -59,7 +59,7 @@ FEW_PHOTOS = 40  # training photos; the hull of fewer silhouettes is too large
 DROPOUT = 0.25  # probability, multiplied by 1 - photos / FEW_PHOTOS
 MAX_DROPOUT = 0.2  # largest probability
 DROPOUT_UNTIL = 1460 / 3400  # fraction of the training steps over which the probability rises
-MIN_FOR_SKY = 12  # training photos; fewer show too little of the background
+MIN_PHOTOS_FOR_SKY = 12  # training photos; fewer show too little of the background
 MAX_ERROR = 1.0  # px, mean reprojection error at the training size; poses are optimized if it is this large
 POSES_START = 500 / 3400  # fraction of the training steps after which poses are optimized
 
@@ -101,7 +101,7 @@ class Photos(Adaptation):
         )
 
         # The modules log what they choose for the sky and for exposures.
-        sky = {"type": "auto"} if measures.photograph_count >= MIN_FOR_SKY else None
+        sky = {"type": "auto"} if measures.photograph_count >= MIN_PHOTOS_FOR_SKY else None
         reason = "a sky, if they show one" if sky else "too few for a sky"
         yield Decision(key="model.background", value=sky, reason=f"{count}: {reason}", matters=False)
 

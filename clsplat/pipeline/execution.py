@@ -21,7 +21,7 @@ ENGINE = r"^(inline|local|(dask|tls)://[^/:\s]+:(\d{1,5}))$"
 LAST_PORT = 65_535
 LOOPBACK = ("127.0.0.1", "localhost")
 STORE_KEYS = ("devices", "placement", "retries")  # have an effect only with a store
-ON_ONLY = "a pipeline file may not set this; set it in a file for --on"
+ONLY_IN_ON_FILE = "a pipeline file may not set this; set it in a file for --on"
 
 
 class Placement(Settings):
@@ -59,7 +59,7 @@ def _check_local_engine(value: Any) -> Any:
 class LocalExecution(Settings):
     """How the cells of a matrix run on this machine."""
 
-    unavailable: ClassVar[Mapping[str, str]] = dict.fromkeys(("store", "insecure", "tls"), ON_ONLY)
+    unavailable: ClassVar[Mapping[str, str]] = dict.fromkeys(("store", "insecure", "tls"), ONLY_IN_ON_FILE)
 
     engine: Annotated[str, BeforeValidator(_check_local_engine), Field(pattern=LOCAL_ENGINE)] = "inline"
     """inline: one after another in this process; local: one process per device of this machine, with a store."""

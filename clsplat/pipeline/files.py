@@ -14,28 +14,29 @@ from clsplat.core.files import PIPELINE
 from clsplat.core.reading import read_file
 from clsplat.core.resources import resource_dir
 
-ENDINGS = {"short": "_7k", "draft": "_draft", "high": "_high"}  # suffixes of variants' names, by key in the file
-VARIANT_KEY = re.compile(rf"^({'|'.join(ENDINGS)})\s*:".encode(), re.MULTILINE)
+VARIANT_SUFFIXES = {"short": "_7k", "draft": "_draft", "high": "_high"}  # of names, by key in the file
+VARIANT_KEY = re.compile(rf"^({'|'.join(VARIANT_SUFFIXES)})\s*:".encode(), re.MULTILINE)
 
 
 def shipped_pipelines() -> dict[str, Path]:
     """Return the paths of the shipped pipelines by name, sorted."""
     files = list(resource_dir("pipelines").glob("*.yaml"))
     keys = {file: VARIANT_KEY.findall(file.read_bytes()) for file in files}
-    files += [file.with_stem(file.stem + ENDINGS[key.decode()]) for file in files for key in keys[file]]
+    files += [file.with_stem(file.stem + VARIANT_SUFFIXES[key.decode()]) for file in files for key in keys[file]]
     return {file.stem: file for file in sorted(files)}
 
 
 def origin(path: Path) -> Path:
     """Return the file on disk that defines a pipeline: NAME.yaml for NAME_7k.yaml if only the first exists."""
     key = variant_key(path)
-    base = path.with_stem(path.stem.removesuffix(ENDINGS[key])) if key else path
+    base = path.with_stem(path.stem.removesuffix(VARIANT_SUFFIXES[key])) if key else path
     return base if base != path and base.is_file() and not path.exists() else path
 
 
 def variant_key(path: Path) -> str | None:
     """Return the key that defines a variant, such as `short` for NAME_7k.yaml; None for other names."""
-    return next((key for key, ending in ENDINGS.items() if path.stem.endswith(ending) and path.stem != ending), None)
+    keys = (key for key, suffix in VARIANT_SUFFIXES.items() if path.stem.endswith(suffix) and path.stem != suffix)
+    return next(keys, None)
 
 
 def variant_name(name: str, key: str) -> str:
@@ -43,7 +44,7 @@ def variant_name(name: str, key: str) -> str:
     path = find(name)
     if key.encode() not in VARIANT_KEY.findall(read_file(origin(path), "a pipeline file", ConfigError)):
         raise ConfigError(f"{name}: has no variant '{key}'; use a pipeline that has one, such as `photos`")
-    return str(Path(name).with_stem(path.stem + ENDINGS[key]))
+    return str(Path(name).with_stem(path.stem + VARIANT_SUFFIXES[key]))
 
 
 def find(name: str) -> Path:

@@ -18,7 +18,7 @@ from clsplat.pipeline import plugins
 from clsplat.pipeline.adapt import Decision
 from clsplat.pipeline.explanation import explain, first_fault, key_path_text
 from clsplat.pipeline.file import STAGE_LISTS, PipelineFile
-from clsplat.pipeline.files import ENDINGS, find
+from clsplat.pipeline.files import VARIANT_SUFFIXES, find
 from clsplat.pipeline.overrides import CADENCE, NoSuchKey, apply, list_keys, split, suggestion
 from clsplat.pipeline.yaml_file import Document, KeyPath, read_yaml, yaml_text
 from clsplat.prepare.cache import PlannedStep, plan
@@ -254,7 +254,7 @@ def _changes_photos(override: str) -> bool:
 
 def _tag_file(document: Document, path: Path) -> dict[str, Any]:
     """Return the file's data with each stage as {stage: name, …}, which selects its model, and without the variants."""
-    data = {key: value for key, value in document.data.items() if key not in ENDINGS}
+    data = {key: value for key, value in document.data.items() if key not in VARIANT_SUFFIXES}
     for key in STAGE_LISTS:
         if isinstance(data.get(key), list):
             data[key] = [_tag_stage(item, (key, i), document, path) for i, item in enumerate(data[key])]

@@ -12,7 +12,7 @@ from clsplat.core.settings import Settings, needs_settings, variants
 from clsplat.core.text_table import text_table
 from clsplat.pipeline.execution import LocalExecution
 from clsplat.pipeline.file import PipelineFile
-from clsplat.pipeline.files import ENDINGS, find, origin, shipped_pipelines
+from clsplat.pipeline.files import VARIANT_SUFFIXES, find, origin, shipped_pipelines
 from clsplat.pipeline.loading import load
 from clsplat.pipeline.matrix import Matrix
 from clsplat.pipeline.overrides import Key, list_keys
@@ -102,7 +102,7 @@ def json_schema() -> dict[str, Any]:
         definition = cls.model_json_schema()
         definitions |= {**definition.pop("$defs", {}), cls.__name__: definition}
         schema["properties"][key] = {"$ref": f"#/$defs/{cls.__name__}"}
-    for key, ending in ENDINGS.items():
+    for key, ending in VARIANT_SUFFIXES.items():
         text = f"Values for the pipeline NAME{ending}, by keys as for --set; the comment above describes that pipeline."
         schema["properties"][key] = {"type": "object", "title": key.title(), "description": text}
     schema["required"].remove("stages")  # not required if the matrix lists pipelines

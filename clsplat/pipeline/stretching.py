@@ -23,7 +23,7 @@ from clsplat.training.stage import Scheduled, Training
 Value = TypeVar("Value")
 TrainingT = TypeVar("TrainingT", bound=Training)
 MAX_STEP = 2**63 - 1  # the largest that a file can store
-PARTS = 10**6  # parts of a step; intervals are multiples of a part, which a file stores exactly
+STEP_PARTS = 10**6  # parts of a step; intervals are multiples of a part, which a file stores exactly
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,13 @@ class StepScaling:
     exact: Fraction
     """Factor of the number of steps."""
     factor: Fraction
-    """Factor of all other steps: `exact`, rounded up to a multiple of 1 / PARTS."""
+    """Factor of all other steps: `exact`, rounded up to a multiple of 1 / STEP_PARTS."""
 
     @classmethod
     def from_factor(cls, factor: float | Fraction) -> "StepScaling":
         """Return the scaling by a factor; a float is converted by its shortest decimal representation."""
         exact = factor if isinstance(factor, Fraction) else Fraction(str(factor))
-        return cls(exact, Fraction(math.ceil(exact * PARTS), PARTS))
+        return cls(exact, Fraction(math.ceil(exact * STEP_PARTS), STEP_PARTS))
 
     def scale(self, step: int) -> int:
         """Return a stretched step."""

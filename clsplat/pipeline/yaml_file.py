@@ -18,17 +18,17 @@ from ruamel.yaml.reader import ReaderError
 
 from clsplat.core.errors import ConfigError, quote, shorten
 from clsplat.core.reading import read_text
-from clsplat.pipeline.files import ENDINGS, origin, variant_key
+from clsplat.pipeline.files import VARIANT_SUFFIXES, origin, variant_key
 
 SIZE_LIMIT = 1 << 20  # bytes
 NODE_LIMIT = 20_000  # values after aliases are expanded, so that nested aliases cannot fill the memory
 DEPTH_LIMIT = 50  # nested lists and maps
 INTEGER_LIMIT = 1 << 63
-CORE = "tag:yaml.org,2002:"
-MERGE = f"{CORE}merge"
-SCALAR_TAGS = tuple(CORE + name for name in ("null", "bool", "int", "float", "str"))
+CORE_TAG_PREFIX = "tag:yaml.org,2002:"
+MERGE = f"{CORE_TAG_PREFIX}merge"
+SCALAR_TAGS = tuple(CORE_TAG_PREFIX + name for name in ("null", "bool", "int", "float", "str"))
 PLAIN_TYPES = (bool, int, float, str)  # types of scalars, whose subclasses in ruamel also store the notation of a value
-TEXT_TAGS = tuple(CORE + name for name in ("timestamp", "value"))  # dates and `=` are text
+TEXT_TAGS = tuple(CORE_TAG_PREFIX + name for name in ("timestamp", "value"))  # dates and `=` are text
 KeyPath = tuple[str | int, ...]
 
 
@@ -99,7 +99,7 @@ def _apply_variant(text: str, path: Path, file: Path, name: str) -> str:
         )
     root = YAML(typ="safe", pure=True).compose(text)
     summary, settings, edits = "", {}, []
-    for key, variant in [pair for pair in root.value if pair[0].value in ENDINGS]:
+    for key, variant in [pair for pair in root.value if pair[0].value in VARIANT_SUFFIXES]:
         root.value.remove((key, variant))  # the keys inside it cannot be set
         comment = re.findall(r"(?:^#.*\n)*\Z", text[: key.start_mark.index], re.MULTILINE)[0]
         edits.append((key.start_mark.index - len(comment), variant.end_mark.index, ""))
@@ -196,16 +196,16 @@ class _Reader:
         self._remaining -= 1
         if self._remaining < 0:
             raise _BadValue(node, f"more than {NODE_LIMIT} values")
-        if isinstance(node, MappingNode) and node.tag == f"{CORE}map":
+        if isinstance(node, MappingNode) and node.tag == f"{CORE_TAG_PREFIX}map":
             return self._map(node, key_path)
-        if isinstance(node, SequenceNode) and node.tag == f"{CORE}seq":
+        if isinstance(node, SequenceNode) and node.tag == f"{CORE_TAG_PREFIX}seq":
             self._lines |= {(*key_path, i): item.start_mark.line + 1 for i, item in enumerate(node.value)}
             return [self._plain(item, (*key_path, i)) for i, item in enumerate(node.value)]
         if isinstance(node, ScalarNode) and node.tag in TEXT_TAGS:
             return str(node.value)
         if isinstance(node, ScalarNode) and node.tag in SCALAR_TAGS:
             return self._scalar(node)
-        tag = shorten(str(node.tag).replace(CORE, "!!"))
+        tag = shorten(str(node.tag).replace(CORE_TAG_PREFIX, "!!"))
         raise _BadValue(node, f"the tag {tag} is not allowed; expected text, a number, a list or keys and values")
 
     def _map(self, node: MappingNode, key_path: KeyPath) -> dict[str, Any]:
@@ -243,7 +243,7 @@ class _Reader:
         try:
             value = self._scalars.construct_object(node)
         except (ValueError, KeyError, IndexError):
-            type_name = str(node.tag).removeprefix(CORE)
+            type_name = str(node.tag).removeprefix(CORE_TAG_PREFIX)
             raise _BadValue(node, f"{quote(node.value)} cannot be read as {type_name}") from None
         if isinstance(value, int) and abs(value) >= INTEGER_LIMIT:
             raise _BadValue(node, f"{quote(node.value)} is too large; expected a whole number of at most 64 bits")

@@ -14,7 +14,7 @@ import numpy as np
 from clsplat.core.errors import DataError, first_few, pluralize, shell_quote
 from clsplat.core.files import open_atomic
 from clsplat.core.progress import ItemCounter
-from clsplat.core.reading import STARTS, open_regular, read_file
+from clsplat.core.reading import CONTENT_STARTS, open_regular, read_file
 from clsplat.scene.images import (
     IMAGE_SUFFIXES,
     JPEG,
@@ -157,7 +157,7 @@ def failure_reason(photograph: Path, error: DataError) -> str:
 
 def remedy_for(read_errors: Mapping[str, str]) -> str:
     """Return a remedy for photographs that cannot be read.  read_errors: reasons by name, from `gather`."""
-    remedies = {f"the file is {content}": remedy for _, content, remedy in STARTS}
+    remedies = {f"the file is {content}": remedy for _, content, remedy in CONTENT_STARTS}
     for name in BRANDS:
         remedies[OTHER_FORMAT.format(name)] = f"convert {name} files to JPEG, for example with {CONVERTERS[name][1]}"
     sentences = [remedy for reason, remedy in remedies.items() if reason in read_errors.values()]

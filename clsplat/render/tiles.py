@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from clsplat.opencl.device import Array, Device, constants
-from clsplat.render.workspace import GROWTH, Workspace
+from clsplat.render.workspace import GROWTH_FACTOR, Workspace
 
 Sort = Literal["auto", "radix", "bitonic"]
 Defines = dict[str, int] | None  # macros of the projection
@@ -204,7 +204,7 @@ class Tiler:
     def _grow(self, pairs: int, limit: int) -> None:
         if pairs > limit:
             raise TooManyPairs
-        self._capacity = min(int(pairs * GROWTH), limit) if self._capacity else pairs
+        self._capacity = min(int(pairs * GROWTH_FACTOR), limit) if self._capacity else pairs
 
     def reset_capacity(self) -> None:
         """Forget the capacity for pairs, so that the next lists get exactly the memory that they need."""
@@ -270,8 +270,9 @@ class Tiler:
             digit_count = self.workspace.array("digit_count", digits * blocks, np.uint32)
             self._radix.radix_count(digit_count=digit_count, **arguments)
             digit_offset = self.scan(digit_count, digits * blocks, "digit_offset")
+            growth = 1.0 if key_count else GROWTH_FACTOR
             sorted_keys, sorted_values = (
-                self.workspace.array(f"{name}_{part}{number % 2}", capacity, np.uint32, 1.0 if key_count else GROWTH)
+                self.workspace.array(f"{name}_{part}{number % 2}", capacity, np.uint32, growth)
                 for part in ("keys", "values")
             )
             self._radix.radix_scatter(

@@ -10,7 +10,7 @@ from clsplat.core.errors import MemoryLimitError
 from clsplat.opencl.device import Array, Device
 from clsplat.opencl.plan import Plans
 
-GROWTH = 1.25  # factor on the requested length when an array grows
+GROWTH_FACTOR = 1.25  # factor on the requested length when an array grows
 
 
 class Workspace:
@@ -22,7 +22,7 @@ class Workspace:
         self._arrays: dict[str, Array] = {}
 
     def array(
-        self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32, slack: float = GROWTH
+        self, name: str, shape: int | tuple[int, ...], dtype: DTypeLike = np.float32, slack: float = GROWTH_FACTOR
     ) -> Array:
         """Return an array of this shape; its values are undefined.
 

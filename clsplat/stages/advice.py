@@ -16,7 +16,7 @@ from clsplat.training.modules.sky_choice import sky_reason
 from clsplat.training.run import Run
 
 MAX_LINES = 5
-MAX_MEASURED = 24  # training views, evenly spaced
+MAX_RENDERED_VIEWS = 24  # training views, evenly spaced
 MAX_NAMES = 3  # of photos in a sentence
 OUTLIER_DB = 5.0  # below the median of the views
 MIN_EXPOSURE_GAIN = 1.0  # dB, by a gain per channel and photo
@@ -26,17 +26,17 @@ FEW_PHOTOS = 24  # for training
 AIMED_COSINE = 0.8  # mean cosine between camera axes and the directions to the center: cameras look at one point
 MIN_OFFSET = 0.3  # of the distance to the center, perpendicular to the upward axis: cameras surround the center
 MIN_GAP = 40.0  # degrees around the center without a photo
-OPEN_SIDE = 120.0  # degrees; a wider gap is a side that was left out on purpose
+OPEN_SIDE_DEGREES = 120.0  # degrees; a wider gap is a side that was left out on purpose
 MIN_GAP_RATIO = 3.0  # to the median gap
 
 
 def collect_advice(run: Run, is_overfit: bool) -> list[str]:
     """Return at most MAX_LINES sentences of advice, the most important first, each with a command.
 
-    The list is empty if nothing stands out.  Renders at most MAX_MEASURED training views.
+    The list is empty if nothing stands out.  Renders at most MAX_RENDERED_VIEWS training views.
     """
     views = learned_scene(run).downscaled(run.downscale).split("train")
-    sample = sample_views(views, MAX_MEASURED)
+    sample = sample_views(views, MAX_RENDERED_VIEWS)
     counted_views = run.status.counted(run.until_interrupted(sample), "views", len(sample))
     metrics = measure(run.painter(), sample, run.photographs, colors=Gains(), progress=counted_views)
     lines = [line for line in run.records.read("view") if line["downscale"] == run.downscale]
@@ -141,7 +141,7 @@ def find_widest_gap(views: Sequence[View]) -> tuple[float, str, str] | None:
         return None
     order = np.argsort(angles, kind="stable")
     gaps = np.degrees(np.diff(np.append(angles[order], angles[order[0]] + 2 * np.pi)))
-    inner_gaps = np.where(gaps < OPEN_SIDE, gaps, 0.0)
+    inner_gaps = np.where(gaps < OPEN_SIDE_DEGREES, gaps, 0.0)
     index = int(np.argmax(inner_gaps))
     if inner_gaps[index] < max(MIN_GAP, MIN_GAP_RATIO * float(np.median(gaps))):
         return None

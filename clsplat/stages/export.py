@@ -20,7 +20,8 @@ from clsplat.training.modules.base import learned_scene
 from clsplat.training.run import Run, host_model, sky_center
 from clsplat.training.stage import CADENCE, Scheduled, Stage, path_in_run
 
-ENDINGS = tuple(end for end in endings() if end.startswith(".") and writing_format(Path(end)).is_model)  # no folders
+# no folders
+FILE_ENDINGS = tuple(end for end in endings() if end.startswith(".") and writing_format(Path(end)).is_model)
 LOG = logging.getLogger("clsplat")
 
 
@@ -37,7 +38,7 @@ class Export(Scheduled):
     needs: ClassVar[frozenset[str]] = frozenset({"model"})
     output_keys: ClassVar[frozenset[str]] = CADENCE | {"file", "quality", "sky"}
 
-    file: Annotated[str, path_in_run(*ENDINGS)] = "point_cloud.ply"
+    file: Annotated[str, path_in_run(*FILE_ENDINGS)] = "point_cloud.ply"
     """Path inside the run folder; the extension selects the format: .ply, .spz, .sog, .glb, .splat, .usda."""
     quality: Quality = "balanced"
     """Precision of harmonics, colors, positions and rotations in SPZ and SOG."""

@@ -31,7 +31,7 @@ from clsplat.training.stage import Stage
 # Sources of points: the scene, a plane sweep over the photos, the visual hull.
 
 LOG = logging.getLogger("clsplat")
-MIN_USABLE = 100  # with fewer points from a sweep or a hull, random ones are used
+MIN_POINTS = 100  # with fewer points from a sweep or a hull, random ones are used
 
 
 def scene_points(scene: Scene) -> PointCloud:
@@ -64,7 +64,7 @@ def points_with_sweep(run: Run, count: int) -> PointCloud:
 def try_sweep(run: Run, count: int) -> PointCloud | None:
     """Return the points of `sweep_photos`, or None, with a warning, if there are too few."""
     points = sweep_photos(run, count)
-    if len(points) < MIN_USABLE:
+    if len(points) < MIN_POINTS:
         remedy = "photos taken closer together give more"
         LOG.warning("the plane sweep found only %d points; starting from random points; %s", len(points), remedy)
         return None
@@ -74,7 +74,7 @@ def try_sweep(run: Run, count: int) -> PointCloud | None:
 def sample_hull(run: Run, count: int) -> PointCloud | None:
     """Return at most `count` points on the visual hull, or None, with a warning, if there are too few."""
     points = hull_points(_training_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
-    if len(points) < MIN_USABLE:
+    if len(points) < MIN_POINTS:
         remedy = "it needs photos with a transparent background and no mask files; otherwise, use init: {source: sweep}"
         LOG.warning("the visual hull has only %d points; starting from random points; %s", len(points), remedy)
         return None

@@ -10,7 +10,7 @@ from clsplat.gaussians.motion import static_motion
 from clsplat.render.filters import Motion
 from clsplat.scene.scene import Scene
 
-STREAM = 4  # stream of random numbers, different from the stream of the points
+RANDOM_STREAM = 4  # stream of random numbers, different from the stream of the points
 NEIGHBORS = 16  # number of nearest points whose timestamps decide whether a point is static (our choice)
 STATIC_SPREAD = 0.18  # spread of these timestamps above which a point is static (our choice)
 
@@ -45,7 +45,7 @@ def add_motion(
         return parameters
     count = len(parameters["means"])
     table, fields = static_motion(count, motion.width), motion_fields(motion.width)
-    times = np.random.default_rng([seed, count, STREAM]).uniform(0, 1, count)
+    times = np.random.default_rng([seed, count, RANDOM_STREAM]).uniform(0, 1, count)
     duration = np.full(count, np.log(durations[0]))
     if point_times is not None:
         times = point_times.astype(np.float64)

@@ -33,9 +33,9 @@ BLOCK = 1 << 16  # points on the device at a time, since points have many compon
 VECTORS_PER_LAUNCH = 1024  # vectors per kernel launch, which fit in the cache of a core
 Floats = NDArray[np.float64]
 Nearest = Callable[[NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]
-UNSEEN = 0.05  # weight of all directions relative to the observed ones; 0.01 to 0.05 give lego the same errors
-FAINT = 1.0e-3  # weight of a Gaussian that no view shows, as a fraction of the mean weight
-ROUNDS = 4  # iterations of Lloyd's algorithm; a fifth lowers the error of lego by 0.6 %
+UNSEEN_WEIGHT = 0.05  # weight of all directions relative to the observed ones; 0.01 to 0.05 give lego the same errors
+MIN_WEIGHT = 1.0e-3  # weight of a Gaussian that no view shows, as a fraction of the mean weight
+LLOYD_ITERATIONS = 4  # iterations of Lloyd's algorithm; a fifth lowers the error of lego by 0.6 %
 
 
 class PaletteSh(Scheduled):
@@ -165,7 +165,8 @@ class VisibleError:
         mean = first / np.where(weights > 0, weights, 1)
         for index, (row, column) in enumerate(zip(i, j, strict=True)):
             second[index] -= mean[row] * first[column]
-        second[i == j] += UNSEEN / (4 * np.pi) * (weights + FAINT * weights.mean())  # |e|^2 / 4 pi over the sphere
+        # |e|^2 / 4 pi over the sphere
+        second[i == j] += UNSEEN_WEIGHT / (4 * np.pi) * (weights + MIN_WEIGHT * weights.mean())
         return cls(weights, np.ascontiguousarray(mean.T), second)
 
     def gradient(self, sh_rest: NDArray[np.floating]) -> Floats:
@@ -195,7 +196,7 @@ class VisibleError:
         """
         products = self.gradient(sh_rest)
         points = self._points(products)
-        for _ in range(ROUNDS):
+        for _ in range(LLOYD_ITERATIONS):
             labels = nearest(points, _append_products(vectors))
             vectors = self._optimal_vectors(products, labels, vectors)
         return vectors, nearest(points, _append_products(vectors))
@@ -204,7 +205,7 @@ class VisibleError:
         """Return the points whose dot products `nearest` compares, [N, 3 K + K(K+1)/2]."""
         count, vector_size = products.shape
         i, j = np.triu_indices(self.mean.shape[1])
-        scale = 1 / np.maximum(self.weights + FAINT * self.weights.mean(), 1e-30)
+        scale = 1 / np.maximum(self.weights + MIN_WEIGHT * self.weights.mean(), 1e-30)
         points = np.empty((count, vector_size + len(i)), np.float32)
         for column in range(vector_size):  # one column at a time, to save memory
             points[:, column] = products[:, column] * scale

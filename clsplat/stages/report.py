@@ -37,14 +37,14 @@ def draw_cameras(run: Run) -> list[Markup]:
 # Curves over steps, and of the Gaussians.
 
 NAMES = {"train": "training views", "test": "test views", "validation": "validation views"}
-DOTTED = 2  # index into DASHES
+DOTTED_DASH = 2  # index into DASHES
 
 
 def training_charts(run: Run) -> list[Markup]:
     """Draw PSNR, loss, number of Gaussians and time per step over the steps."""
     records = run.records.read("train")
     psnr_lines, trial_lines = _psnr_lines(run), _psnr_lines(run, trial=True)
-    dash = DOTTED if any(line.name == NAMES["train"] for line in psnr_lines) else 0
+    dash = DOTTED_DASH if any(line.name == NAMES["train"] for line in psnr_lines) else 0
     psnr = list(zip([r["step"] for r in records], moving_average([r["psnr"] for r in records]), strict=True))
     series = {key: [(r["step"], r[key]) for r in records if key in r] for key in ("loss", "gaussians", "ms")}
     running_mean = Line(psnr, f"training views, mean of the last {PSNR_REPORTS}", COLORS[0], dash)

@@ -23,7 +23,7 @@ from clsplat.viewer.video.paths import MAX_FRAMES, RATES, check_size, validate_s
 from clsplat.viewer.video.plan import FPS, FRAMES, VideoPlan, VideoRequest, plan_video, render_video, resize_view
 
 LOG = logging.getLogger("clsplat")
-KIND = "snapshot"  # of lines in metrics.jsonl
+RECORD_KIND = "snapshot"  # of lines in metrics.jsonl
 FOLDER = "timelapse"
 
 
@@ -68,7 +68,7 @@ class Snapshot(Scheduled):
         view = resize_view(self._view(run), check_size(self.size) if self.size else None)
         path = run.out / self.folder / f"step_{run.step:06d}.png"
         write_image(path, Canvas(run.painter()).render_image(view))
-        run.records.add(run.step, KIND, folder=self.folder, file=path.name)
+        run.records.add(run.step, RECORD_KIND, folder=self.folder, file=path.name)
 
 
 class Timelapse(Stage):
@@ -90,7 +90,8 @@ class Timelapse(Stage):
 
     def _files(self, run: Run) -> list[Path]:
         """Return the paths of this run's renders, in step order; the folder may also contain those of earlier runs."""
-        files = {line["step"]: line["file"] for line in run.records.read(KIND) if line.get("folder") == self.folder}
+        lines = run.records.read(RECORD_KIND)
+        files = {line["step"]: line["file"] for line in lines if line.get("folder") == self.folder}
         return [run.out / self.folder / files[step] for step in sorted(files)]
 
     def run(self, run: Run) -> None:

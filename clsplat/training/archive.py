@@ -23,7 +23,7 @@ from clsplat.core.errors import DataError, OutputError, one_line, shorten
 from clsplat.core.reading import open_regular
 
 META, META_DIGEST, DIGESTS = "meta", "meta_sha256", "sha256"
-DAMAGE = {None, errno.EINVAL, errno.EISDIR, errno.EIO}  # a seek before the start, a folder, a bad sector
+DAMAGE_ERRNOS = {None, errno.EINVAL, errno.EISDIR, errno.EIO}  # a seek before the start, a folder, a bad sector
 Metadata = dict[str, Any]
 Arrays = dict[str, NDArray[np.float32]]
 
@@ -54,7 +54,7 @@ def read(path: Path) -> tuple[Metadata, Arrays]:
     except MemoryError:
         raise
     except Exception as error:  # zipfile and NumPy raise many types for damaged bytes, such as EOFError and TokenError
-        if isinstance(error, OSError) and error.errno not in DAMAGE:
+        if isinstance(error, OSError) and error.errno not in DAMAGE_ERRNOS:
             raise OutputError(f"{path}: cannot be read ({error.strerror}); check the disk and permissions") from error
         if isinstance(error, DataError):
             raise

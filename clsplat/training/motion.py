@@ -14,8 +14,8 @@ from clsplat.gaussians.structs import GaussianGradients, moment_tables
 from clsplat.opencl.device import Array, constants
 
 MAX_LOG_DURATION = 15.0  # longer durations look the same
-UNBOUNDED = 3.0e38
-IN_EXTENTS = ("velocity", "acceleration", "jerk")
+NO_BOUND = 3.0e38
+RATES_IN_EXTENTS = ("velocity", "acceleration", "jerk")
 Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=100.0))]
 
 
@@ -53,7 +53,7 @@ class MotionRates(Settings):
     def at(self, step: int, extent: float) -> dict[str, float]:
         """Return the rates at a global step, by field, and `min_duration`.  extent: extent of the scene."""
         rates = {name: at_step(getattr(self, name), step) for name in self._rates}
-        return {**rates, **{name: rates[name] * extent for name in IN_EXTENTS}, "min_duration": self.min_duration}
+        return {**rates, **{name: rates[name] * extent for name in RATES_IN_EXTENTS}, "min_duration": self.min_duration}
 
 
 def update_motion(
@@ -85,7 +85,7 @@ def update_motion(
         "count": gaussians.count,
     }
     for name, columns in motion_fields(table.components).items():
-        lowest, highest = bounds.get(name, (-UNBOUNDED, UNBOUNDED))
+        lowest, highest = bounds.get(name, (-NO_BOUND, NO_BOUND))
         gaussians.device.program("motion.cl").motion_step(
             items=(-(-gaussians.count // int(gaussians.device.tuning["LANES"])), columns.stop - columns.start),
             **arguments,

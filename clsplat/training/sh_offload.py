@@ -9,7 +9,7 @@ from clsplat.training.memory import VISIBLE_FRACTION, Location, MemoryPlan, offl
 from clsplat.training.run import Run
 
 LOG = logging.getLogger("clsplat")
-FACTOR = 2  # largest expected growth of the number of Gaussians in an edit
+GROWTH_FACTOR = 2  # largest expected growth of the number of Gaussians in an edit
 VIEWS = 16  # number of views rendered to measure the fraction of visible Gaussians
 
 
@@ -49,7 +49,8 @@ def device_capacity(run: Run, required: float = math.inf) -> int:
     """
     location = offload_target(run.harmonics, run.device.info)
     capacity = _plan(run, location if run.harmonics == "host" else "device").limit
-    if run.harmonics != "auto" or location == "device" or min(required, FACTOR * run.model.gaussians.count) <= capacity:
+    wanted = min(required, GROWTH_FACTOR * run.model.gaussians.count)
+    if run.harmonics != "auto" or location == "device" or wanted <= capacity:
         return capacity
     current = run.model.gaussians.count if run.stage_step else 0
     return max(capacity, current, _plan(run, "host", _visible_fraction(run)).limit)

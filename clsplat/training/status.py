@@ -118,7 +118,7 @@ def status_schema() -> dict[str, Any]:
 
 
 LOG = logging.getLogger("clsplat")
-BEAT = 5.0  # s between writes
+HEARTBEAT_INTERVAL_S = 5.0  # s between writes
 Item = TypeVar("Item")
 
 
@@ -261,7 +261,7 @@ class StatusFile:
 
 def _refresh_until(ended: threading.Event, reference: "weakref.ref[StatusFile]") -> None:
     """Refresh a status until its run ends or it is garbage-collected."""
-    while not ended.wait(BEAT):
+    while not ended.wait(HEARTBEAT_INTERVAL_S):
         status = reference()
         if status is None:
             return

@@ -10,7 +10,7 @@ import pytest
 
 from clsplat.conformance import supervision, worker
 from clsplat.conformance.check import Note
-from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS
+from clsplat.conformance.checks import BITONIC, ESSENTIAL_CHECKS, KERNELS
 from clsplat.core.resources import resource_dir
 from clsplat.opencl.device import parse_kernels
 from tests.support.deviations import assert_within_bounds
@@ -22,7 +22,7 @@ def cases() -> list[Any]:
     run, which are smaller, with one setting.
     """
     wide = [(check, setting) for check, setting in zip(KERNELS, itertools.cycle(("wide16", "wide8")), strict=False)]
-    small = zip((*ESSENTIAL, *BITONIC), itertools.cycle(TUNINGS), strict=False)
+    small = zip((*ESSENTIAL_CHECKS, *BITONIC), itertools.cycle(TUNINGS), strict=False)
     actual = [*wide, *((check, "simt") for check in KERNELS), *small]
     return [
         pytest.param((name, setting), check, id=f"{name}-{setting}-{check.name.replace(' ', '_')}")

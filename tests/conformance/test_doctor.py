@@ -14,7 +14,7 @@ import clsplat
 from clsplat import cli
 from clsplat.conformance import doctor, reference, supervision
 from clsplat.conformance.check import Check, Deviation, Note
-from clsplat.conformance.checks import BY_NAME, KERNELS, SPEED, whole
+from clsplat.conformance.checks import BY_NAME, KERNELS, SPEED_CHECKS, whole
 from clsplat.conformance.doctor import DeviceReport, examine, judge, report_page
 from clsplat.conformance.supervision import CheckResult, run_checks
 from clsplat.core.errors import ConfigError, MemoryLimitError, OutputError
@@ -278,7 +278,7 @@ def test_faulty_device_exits_with_code_4(monkeypatch, capsys, info, empty_cache,
     data = json.loads(out)
     assert data["verdict"]["usable"] == (code == 0)
     assert len(data["schedules"]["simt"]) == len(KERNELS)
-    assert len(data["once"]) == len(SPEED)
+    assert len(data["once"]) == len(SPEED_CHECKS)
     if code:
         assert "do not use it: blend_backward differs by 0.3" in err
 
@@ -318,7 +318,7 @@ def test_correct_device_is_not_refused(info, empty_cache, monkeypatch):
     """Runs some checks in child processes; tests/conformance/test_checks_kernels.py runs all of them."""
     monkeypatch.setattr(doctor, "KERNELS", [BY_NAME["blur"], KERNELS[-1]])
     monkeypatch.setattr(doctor, "TILED", [KERNELS[-1]])
-    monkeypatch.setattr(doctor, "SPEED", SPEED[:1])
+    monkeypatch.setattr(doctor, "SPEED_CHECKS", SPEED_CHECKS[:1])
     report = examine(Device(info))
     assert report.verdict.text == "use it", report.text()
     assert list(report.schedules) == ["simt", "simt16", *(["wide"] if report.default == "wide" else [])]

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from clsplat.conformance.check import Check, Note
-from clsplat.conformance.checks import BITONIC, ESSENTIAL, KERNELS, SPEED
+from clsplat.conformance.checks import BITONIC, ESSENTIAL_CHECKS, KERNELS, SPEED_CHECKS
 from clsplat.core.resources import resource_dir
 from clsplat.opencl import device as program
 from clsplat.opencl.device import Device, parse_kernels
@@ -278,7 +278,7 @@ OPTIONAL = {  # in what few runs compute: doctor notices them, the check before 
 }
 
 
-CHECKS = {"doctor": [*KERNELS, *SPEED], "a run": [*ESSENTIAL, *BITONIC]}
+CHECKS = {"doctor": [*KERNELS, *SPEED_CHECKS], "a run": [*ESSENTIAL_CHECKS, *BITONIC]}
 
 
 def kernel_names() -> set[str]:

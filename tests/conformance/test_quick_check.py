@@ -13,7 +13,7 @@ import clsplat
 from clsplat.conformance import checks, host, quick, supervision
 from clsplat.conformance import worker as worker_process
 from clsplat.conformance.check import Check
-from clsplat.conformance.checks import ESSENTIAL
+from clsplat.conformance.checks import ESSENTIAL_CHECKS
 from clsplat.conformance.doctor import examine
 from clsplat.conformance.scenes import random_case
 from clsplat.core.errors import DeviceError, MemoryLimitError
@@ -56,7 +56,8 @@ def test_bitonic_is_checked_if_the_run_can_choose_it(monkeypatch, info, empty_ca
 
 
 def test_checks_of_every_run_need_no_bitonic():
-    assert not {"fill_tiles", "sort_tiles", "merge_runs"} & {name for check in ESSENTIAL for name in check.kernels}
+    kernels = {name for check in ESSENTIAL_CHECKS for name in check.kernels}
+    assert not {"fill_tiles", "sort_tiles", "merge_runs"} & kernels
 
 
 def test_doctor_deletes_the_record_of_a_faulty_device(monkeypatch, info, empty_cache):
@@ -84,7 +85,7 @@ def test_lack_of_memory_is_no_device_fault(monkeypatch, info, empty_cache):
 
 def test_damaged_kernel_cache_is_no_device_fault(monkeypatch, info, empty_cache):
     worker(monkeypatch)
-    monkeypatch.setattr(checks, "ESSENTIAL", [Check("cached", ("blend_backward",), None)])
+    monkeypatch.setattr(checks, "ESSENTIAL_CHECKS", [Check("cached", ("blend_backward",), None)])
     with pytest.raises(DeviceError, match=r"cache of built kernels is damaged: remove .*pyopencl"):
         quick.ensure_correct(Device(info))
     assert not list(empty_cache.iterdir())

@@ -91,13 +91,14 @@ def check_chain(
 
     def value() -> float:
         return np.sum(
-            weights * ref.render(gaussians, camera, BACKGROUND, degree, thresholds=ref.SMOOTH, **screen).image
+            weights
+            * ref.render(gaussians, camera, BACKGROUND, degree, thresholds=ref.SMOOTH_THRESHOLDS, **screen).image
         )
 
-    splats = ref.project(gaussians, camera, degree, thresholds=ref.SMOOTH, **screen)
+    splats = ref.project(gaussians, camera, degree, thresholds=ref.SMOOTH_THRESHOLDS, **screen)
     assert splats.visible.all()
     analytic, _ = render_backward(
-        gaussians, camera, BACKGROUND, degree, splats, weights, thresholds=ref.SMOOTH, **screen
+        gaussians, camera, BACKGROUND, degree, splats, weights, thresholds=ref.SMOOTH_THRESHOLDS, **screen
     )
     check_gradients(analytic, gaussians, value)
     return analytic
@@ -125,7 +126,7 @@ def test_chain_mip(rng):
     gaussians = random_gaussians(rng, camera, 1)
     gaussians.log_scales -= 1  # thin ones, so that both filters matter
     gaussians.filter_variance = rng.uniform(0.01, 0.1, len(gaussians.means))
-    splats = ref.project(gaussians, camera, 1, variance=0.1, compensate=1.0, thresholds=ref.SMOOTH)
+    splats = ref.project(gaussians, camera, 1, variance=0.1, compensate=1.0, thresholds=ref.SMOOTH_THRESHOLDS)
     raw = 1 / (1 + np.exp(-gaussians.logit_opacity))
     assert np.all(splats.opacity < 0.9 * raw)
     check_chain(rng, gaussians, camera, 1, variance=0.1, compensate=1.0)
@@ -175,8 +176,8 @@ def test_chain_with_capped_alpha(rng):
     gaussians.logit_opacity[2] = 6
     gaussians.log_scales[2] = np.log([0.8, 0.9, 0.7])  # wide: several pixels above the cap
     splats = ref.project(gaussians, camera, 1)
-    assert any(np.any(step.alpha == 0.99) for step in ref.blend_steps(splats, WIDTH, HEIGHT, ref.SMOOTH))
-    assert ref.margin(splats, WIDTH, HEIGHT, ref.SMOOTH).cap > 10 * STEP, "a pixel would cross the cap"
+    assert any(np.any(step.alpha == 0.99) for step in ref.blend_steps(splats, WIDTH, HEIGHT, ref.SMOOTH_THRESHOLDS))
+    assert ref.margin(splats, WIDTH, HEIGHT, ref.SMOOTH_THRESHOLDS).cap > 10 * STEP, "a pixel would cross the cap"
     check_chain(rng, gaussians, camera, 1)
 
 
@@ -280,7 +281,7 @@ def test_single_isotropic_gaussian():
     color = np.array([0.9, 0.3, 0.1])
     camera = simple_camera(focal=focal)
     gaussians = isotropic([0, 0, depth], scale, opacity, color)
-    frame = ref.render(gaussians, camera, BACKGROUND, 0, thresholds=ref.SMOOTH)
+    frame = ref.render(gaussians, camera, BACKGROUND, 0, thresholds=ref.SMOOTH_THRESHOLDS)
     x, y = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
     alpha = opacity * np.exp(-0.5 * (x**2 + y**2) / ((focal * scale / depth) ** 2 + 0.3))
     expected = color[:, None, None] * alpha + BACKGROUND[:, None, None] * (1 - alpha)
@@ -460,7 +461,7 @@ def test_margin():
     np.testing.assert_allclose(margin.transmittance, 1 - 0.5 * 0.1 / 0.08)
     np.testing.assert_allclose(margin.cap, 1 - 0.9 / 0.99)
     np.testing.assert_allclose(margin.depth, 0.25 / 1.25)
-    assert ref.margin(splats, 1, 1, ref.SMOOTH)[:2] == (np.inf, np.inf)
+    assert ref.margin(splats, 1, 1, ref.SMOOTH_THRESHOLDS)[:2] == (np.inf, np.inf)
 
 
 # ---- Culling and radius -------------------------------------------------------------------------------------------

@@ -117,7 +117,7 @@ def test_bar_is_shown_on_a_terminal_and_not_in_a_pipe(monkeypatch, capsys):
 def screen(monkeypatch) -> io.StringIO:
     """What a terminal shows, of stdout and of stderr."""
     shown = io.StringIO()
-    for name in ("CONSOLE", "ERRORS"):
+    for name in ("CONSOLE", "STDERR_CONSOLE"):
         console = terminal.Console(file=shown, force_terminal=True, width=120, highlight=False)
         monkeypatch.setattr(terminal, name, console)
     return shown

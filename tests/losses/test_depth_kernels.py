@@ -48,14 +48,14 @@ def test_reference_gradient_matches_finite_differences(rng):
     """By parameters, so that depths move too."""
     case = random_case(rng, 5, 24, 20)
     gaussians, camera, weights = case.gaussians(), case.camera(), rng.normal(size=(20, 24))
-    numbers = {**case.projection_settings(), "thresholds": ref.SMOOTH}
+    numbers = {**case.projection_settings(), "thresholds": ref.SMOOTH_THRESHOLDS}
 
     def loss(moved: ref.RawGaussians) -> float:
         splats = ref.project(moved, camera, case.degree, **numbers)
-        return float((weights * ref.inverse_depth(splats, 24, 20, ref.SMOOTH)).sum())
+        return float((weights * ref.inverse_depth(splats, 24, 20, ref.SMOOTH_THRESHOLDS)).sum())
 
     splats = ref.project(gaussians, camera, case.degree, **numbers)
-    actual, grad_depth = ref.inverse_depth_backward(splats, 24, 20, weights, ref.SMOOTH)
+    actual, grad_depth = ref.inverse_depth_backward(splats, 24, 20, weights, ref.SMOOTH_THRESHOLDS)
     upstream = actual.mean2d, actual.conic, actual.opacity, actual.color
     settings = case.degree, case.variance, case.compensate
     gradients = ref.project_backward(gaussians, camera, *settings, splats, *upstream)

@@ -16,7 +16,7 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.gaussians.mixture import covariance_matrices
 from clsplat.losses.base import Comparison, ViewGradients
 from clsplat.methods.adc import Clone, PruneFaint
-from clsplat.methods.steepgs import UPPER, SplitSteepest, divide_logits, smallest_eigenvectors
+from clsplat.methods.steepgs import MATRIX_COLUMNS, SplitSteepest, divide_logits, smallest_eigenvectors
 from clsplat.opencl.device import Array, Device
 from clsplat.render.rasterizer import Frame, Rasterizer
 from clsplat.render.workspace import Workspace
@@ -56,8 +56,8 @@ def uncapped_case(rng, opacity=(0.1, 0.7)) -> tuple[Case, ref.Splats, np.ndarray
     case = random_case(rng, 6, 24, 20)
     drawn = rng.uniform(*opacity, (6, 1))
     case.parameters["logit_opacity"][:] = np.log(drawn / (1 - drawn))
-    splats, weights = case.project(ref.SMOOTH), rng.normal(size=(3, 20, 24))
-    return case, splats, weights, ref.screen_splitting(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH)
+    splats, weights = case.project(ref.SMOOTH_THRESHOLDS), rng.normal(size=(3, 20, 24))
+    return case, splats, weights, ref.screen_splitting(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH_THRESHOLDS)
 
 
 def test_mean_of_two_shifts_changes_the_loss_by_the_matrix(rng):
@@ -108,10 +108,10 @@ def test_scene_matrix_holds_where_perspective_is_constant(rng, far, bound):
 
     def projected(moved: np.ndarray) -> ref.Splats:
         own = ref.RawGaussians(scene.means + moved, scene.quats, scene.log_scales, scene.logit_opacity, scene.sh)
-        return ref.project(own, camera, 0, thresholds=ref.SMOOTH)
+        return ref.project(own, camera, 0, thresholds=ref.SMOOTH_THRESHOLDS)
 
     still = projected(np.zeros(3))
-    on_screen = ref.screen_splitting(still, 24, 20, BACKGROUND, weights, ref.SMOOTH)
+    on_screen = ref.screen_splitting(still, 24, 20, BACKGROUND, weights, ref.SMOOTH_THRESHOLDS)
     matrices, alpha = ref.splitting(scene, camera, on_screen), alphas(still, 24, 20)
     before, step = loss_of(alpha, still, weights), 2e-3
     for n in range(6):
@@ -184,7 +184,7 @@ def test_smallest_axes_belong_to_each_matrix(rng):
     assert (axes[np.arange(200), np.abs(axes).argmax(axis=1)] > 0).all()
     np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1)
     for n in range(4, 200):
-        matrix = columns[n][UPPER]
+        matrix = columns[n][MATRIX_COLUMNS]
         size = np.abs(matrix).max()
         np.testing.assert_allclose(matrix @ axes[n], values[n] * axes[n], atol=1e-12 * size)
         for v in rng.normal(size=(20, 3)):

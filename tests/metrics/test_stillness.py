@@ -4,7 +4,16 @@ import cv2
 import numpy as np
 import pytest
 
-from clsplat.metrics.views import HELD_OUT, MAX_NOISE, OTHERS, FlickerMeter, ViewMetrics, mean, means, psnr_by_time
+from clsplat.metrics.views import (
+    HELD_OUT_PSNR,
+    MAX_NOISE,
+    OTHER_PSNR,
+    FlickerMeter,
+    ViewMetrics,
+    mean,
+    means,
+    psnr_by_time,
+)
 from clsplat.scene.camera import Camera
 from clsplat.scene.view import View
 
@@ -106,9 +115,9 @@ def test_held_out_times_are_measured_separately():
     views = [moment(f"{i}", time) for i, time in enumerate((0, 0.5, 1))]
     psnr = {view.name: 20.0 + i for i, view in enumerate(views)}
     moments = psnr_by_time(psnr, views, [views[0], views[2]])
-    assert moments == {"0": {OTHERS: 20.0}, "1": {HELD_OUT: 21.0}, "2": {OTHERS: 22.0}}
+    assert moments == {"0": {OTHER_PSNR: 20.0}, "1": {HELD_OUT_PSNR: 21.0}, "2": {OTHER_PSNR: 22.0}}
     result = mean([ViewMetrics(name, value, 0.9, by_time=moments[name]) for name, value in psnr.items()])
-    assert (result["psnr"], result[HELD_OUT], result[OTHERS]) == (21, 21, 21)
+    assert (result["psnr"], result[HELD_OUT_PSNR], result[OTHER_PSNR]) == (21, 21, 21)
     for trained in (views, [moment("x", 0.2)], [moment("y", None)], []):
         assert not psnr_by_time(psnr, views, trained)
 

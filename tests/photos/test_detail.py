@@ -111,7 +111,7 @@ def test_rates_waiting_for_full_size_are_resolved_before_use():
 def edit_of(count: int, eager: int, step: int = 100) -> SimpleNamespace:
     means = np.where(np.arange(count) < eager, 1e-3, 1e-5).astype(np.float32)
     stats = SimpleNamespace(mean=lambda name: means)
-    return SimpleNamespace(gaussians=SimpleNamespace(count=count), stats=stats, at=lambda value: value, step=step)
+    return SimpleNamespace(gaussians=SimpleNamespace(count=count), stats=stats, evaluate=lambda value: value, step=step)
 
 
 def test_momentum_follows_its_formulas():

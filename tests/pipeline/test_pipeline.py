@@ -324,8 +324,8 @@ def test_invalid_short_value_is_refused_with_its_location(tmp_path, short, words
 def test_variant_keys_are_set_keys():
     for name, path in files.shipped_pipelines().items():
         data = read_yaml(path).data
-        for key in data.keys() & files.ENDINGS.keys():
-            variant = name + files.ENDINGS[key]
+        for key in data.keys() & files.VARIANT_SUFFIXES.keys():
+            variant = name + files.VARIANT_SUFFIXES[key]
             overrides = [f"{key_path}={json.dumps(value)}" for key_path, value in data[key].items()]
             assert load(name, [f"name={variant}", *overrides]).resolved_settings() == load(variant).resolved_settings()
 

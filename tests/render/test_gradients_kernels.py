@@ -6,7 +6,7 @@ import numpy as np
 
 from clsplat.conformance import reference as ref
 from clsplat.conformance.check import GRADIENT, relative_error
-from clsplat.conformance.scenes import SHARP, Case, add_world_filter, random_case, safe_case
+from clsplat.conformance.scenes import SHARP_THRESHOLDS, Case, add_world_filter, random_case, safe_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame, Rasterizer
 from tests.support.devices import on_devices, on_one_setting
@@ -30,7 +30,7 @@ def gradients_of(
     return values, frame, rasterizer
 
 
-def expected_gradients(case: Case, weights: np.ndarray, thresholds: ref.Thresholds = SHARP) -> dict:
+def expected_gradients(case: Case, weights: np.ndarray, thresholds: ref.Thresholds = SHARP_THRESHOLDS) -> dict:
     splats = case.project(thresholds)
     by_parameter, by_splat = render_backward(
         case.gaussians(),
@@ -89,7 +89,7 @@ def test_gradients_with_filters(device, rng, variance, compensate):
     smooth = Device(device.info, device.schedule)
     smooth.tuning.update(device.tuning, ALPHA_MIN="1e-30f", TRANSMITTANCE_MIN="1e-30f")
     values, *_ = gradients_of(smooth, case, weights)
-    compare(values, expected_gradients(case, weights, ref.SMOOTH), GRADIENT)
+    compare(values, expected_gradients(case, weights, ref.SMOOTH_THRESHOLDS), GRADIENT)
 
 
 def test_finished_pixels_pass_no_gradient_behind(device, rng):

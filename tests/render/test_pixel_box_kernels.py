@@ -114,11 +114,11 @@ def test_reference_gradients_match_finite_differences(rng):
     weights, black = rng.normal(size=(3, 12, 16)), np.zeros(3)
 
     def rendered(gaussians: ref.RawGaussians) -> ref.blending.RenderOutput:
-        return ref.render(gaussians, case.camera(), black, 3, 0.2, 0.0, 0.0, ref.SMOOTH, 1.0)
+        return ref.render(gaussians, case.camera(), black, 3, 0.2, 0.0, 0.0, ref.SMOOTH_THRESHOLDS, 1.0)
 
     gaussians = case.gaussians()
     splats = rendered(gaussians).splats
-    actual, _ = render_backward(gaussians, case.camera(), black, 3, splats, weights, 0.0, 0.0, ref.SMOOTH)
+    actual, _ = render_backward(gaussians, case.camera(), black, 3, splats, weights, 0.0, 0.0, ref.SMOOTH_THRESHOLDS)
     for name in ("means", "quats", "log_scales", "logit_opacity"):
         table = getattr(gaussians, name)
         truth = np.zeros_like(table)

@@ -61,13 +61,13 @@ def test_files_of_a_run_have_reserved_names(finished):
     chosen = {path for stage in pipeline.stages for path in stage.outputs(run.out)}
     made = {path.name for path in run.out.iterdir()} - {path.relative_to(run.out).parts[0] for path in chosen}
     assert {"status.json", "metrics.jsonl", "checksums.json"} <= made
-    assert made <= names.RESERVED
+    assert made <= names.RESERVED_NAMES
 
 
 def test_run_file_names_are_listed_and_reserved():
     table = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
     table -= {names.SYSTEM, names.MODULE_FILE_PREFIX, names.STORE}  # the last is a key, too
-    assert {"pipeline.yaml", "run.lock", "compare.html", "undistorted"} < table <= names.RESERVED
+    assert {"pipeline.yaml", "run.lock", "compare.html", "undistorted"} < table <= names.RESERVED_NAMES
     faults = []
     for file in Path(names.__file__).parents[1].rglob("*.py"):
         if file.parent.name in ("api", "cli") or file == Path(names.__file__):  # of a page that is no run's

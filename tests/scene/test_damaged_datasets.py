@@ -273,7 +273,7 @@ def main(base: Path, count: int) -> None:
     from clsplat.opencl import device
 
     device.create_context, device.build = functools.cache(device.create_context), functools.cache(device.build)
-    terminal.ERRORS.width = 10_000
+    terminal.STDERR_CONSOLE.width = 10_000
     cases = []
     for i in range(count):
         start = time.process_time()  # waiting for other processes does not count
@@ -303,7 +303,7 @@ def run_command_line(arguments: list[str]) -> dict[str, object]:
 
     code: object = 0
     sys.argv = ["clsplat", *arguments]
-    with terminal.ERRORS.capture() as errors, contextlib.redirect_stdout(io.StringIO()):
+    with terminal.STDERR_CONSOLE.capture() as errors, contextlib.redirect_stdout(io.StringIO()):
         try:
             cli.main()
         except SystemExit as end:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.stages.palette import FAINT, UNSEEN, VisibleError
+from clsplat.stages.palette import MIN_WEIGHT, UNSEEN_WEIGHT, VisibleError
 
 POSITIONS = np.array([[3.0, 0, 1], [2, 2, 2], [0, 3, 1.5], [-1, 2.5, 0.5], [2.5, -1, 0.2]])
 
@@ -38,7 +38,7 @@ def visible_error(visibility: SimpleNamespace, i: int, error: np.ndarray) -> flo
 def test_quadratic_form_is_the_error_visible_in_the_views(visibility, rng, coefficients):
     result, errors = error_of(visibility, coefficients), rng.normal(size=(60, 3 * coefficients))
     forms = (result.gradient(errors) * errors).sum(axis=1)
-    everywhere = UNSEEN / (4 * np.pi) * (result.weights + FAINT * result.weights.mean())
+    everywhere = UNSEEN_WEIGHT / (4 * np.pi) * (result.weights + MIN_WEIGHT * result.weights.mean())
     expected = [visible_error(visibility, i, errors[i]) for i in range(59)]
     np.testing.assert_allclose(
         (forms - everywhere * np.square(errors).sum(axis=1))[:59], expected, rtol=1e-6, atol=1e-9

@@ -17,7 +17,7 @@ from clsplat.render.rasterizer import PIXEL_SUMS, Rasterizer
 from clsplat.training import checkpoint
 from clsplat.training.archive import split
 from clsplat.training.modules.base import TrainingStep
-from clsplat.training.modules.distractors import NEAR, Distractors, DistractorsState, initial_tables
+from clsplat.training.modules.distractors import NEAR_FRACTION, Distractors, DistractorsState, initial_tables
 from tests.support.runs import FEW, ONE_CORE, digest, train
 
 ON = (*FEW, "optimize.modules.distractors={count: 30, start: 4}")
@@ -66,7 +66,7 @@ class Pair:
         own["log_scales"] = own["log_scales"] + np.log(SCALE)
         own["sh_rest"] = np.zeros((20, 45))
         all_rows = {name: np.concatenate([own[name], table]).astype(np.float32) for name, table in parameters.items()}
-        return replace(self.model, gaussians=Gaussians(self.device, all_rows), near=SCALE * NEAR)
+        return replace(self.model, gaussians=Gaussians(self.device, all_rows), near=SCALE * NEAR_FRACTION)
 
 
 @pytest.mark.parametrize("cover", [0.0, 3.0])

@@ -50,11 +50,11 @@ def test_pose_derivatives_match_those_of_the_image(screen, outside):
 
     def value(shift: np.ndarray, turn: np.ndarray, zoom: float = 0.0) -> float:
         at = ref.move_camera(camera, shift, turn, zoom)
-        frame = ref.render(gaussians, at, BACKGROUND, degree, thresholds=ref.SMOOTH, **screen)
+        frame = ref.render(gaussians, at, BACKGROUND, degree, thresholds=ref.SMOOTH_THRESHOLDS, **screen)
         return float(np.sum(weights * frame.image))
 
-    splats = ref.project(gaussians, camera, degree, thresholds=ref.SMOOTH, **screen)
-    of_splats = ref.blend_backward(splats, camera.width, camera.height, BACKGROUND, weights, ref.SMOOTH)
+    splats = ref.project(gaussians, camera, degree, thresholds=ref.SMOOTH_THRESHOLDS, **screen)
+    of_splats = ref.blend_backward(splats, camera.width, camera.height, BACKGROUND, weights, ref.SMOOTH_THRESHOLDS)
     upstream = of_splats.mean2d, of_splats.conic, of_splats.opacity, of_splats.color
     numbers = screen["variance"], screen.get("compensate", 0.0)
     shift, turn, zoom = ref.pose_gradient(gaussians, camera, degree, *numbers, splats, *upstream)

@@ -45,7 +45,7 @@ def written(monkeypatch, tmp_path):
         write_text(path, text)
 
     monkeypatch.setattr(writing, "write_text", write)
-    monkeypatch.setattr(writing, "BEAT", 0.002)
+    monkeypatch.setattr(writing, "HEARTBEAT_INTERVAL_S", 0.002)
     monkeypatch.setattr(StatusFile, "note", note_and_write)
     return texts
 
@@ -145,7 +145,7 @@ def test_heartbeat_continues_during_long_work(written, tmp_path):
 
 def test_nothing_is_written_after_the_end(tmp_path, monkeypatch):
     """A heartbeat that is being written when a run ends does not stay."""
-    monkeypatch.setattr(writing, "BEAT", 0.001)
+    monkeypatch.setattr(writing, "HEARTBEAT_INTERVAL_S", 0.001)
     waiting, go_on = threading.Event(), threading.Event()
     main = threading.current_thread()
 
@@ -172,7 +172,7 @@ def test_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, caplog
         write_text(path, text)
 
     monkeypatch.setattr(writing, "write_text", write)
-    monkeypatch.setattr(writing, "BEAT", 0.002)
+    monkeypatch.setattr(writing, "HEARTBEAT_INTERVAL_S", 0.002)
     clsplat.run("smoke", tiny_scene, tmp_path / "run", set=SHORT)
     assert json.loads((tmp_path / "run" / "status.json").read_text())["state"] == "done"
     name = tmp_path / "run" / "status.json"
@@ -182,9 +182,9 @@ def test_full_disk_does_not_stop_a_run(tiny_scene, tmp_path, monkeypatch, caplog
 
 
 def test_heartbeat_changes_no_bits(tiny_scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(writing, "BEAT", 1000.0)
+    monkeypatch.setattr(writing, "HEARTBEAT_INTERVAL_S", 1000.0)
     train(tiny_scene, tmp_path / "slow", *FEW)
-    monkeypatch.setattr(writing, "BEAT", 0.0005)
+    monkeypatch.setattr(writing, "HEARTBEAT_INTERVAL_S", 0.0005)
     train(tiny_scene, tmp_path / "fast", *FEW)
     assert digest(tmp_path / "slow") == digest(tmp_path / "fast")
 

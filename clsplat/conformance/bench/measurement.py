@@ -16,7 +16,7 @@ from clsplat.opencl.device import Device, open_device
 from clsplat.opencl.discovery import Schedule
 from clsplat.pipeline.loading import load
 
-EXPECTED = "the JSON of an earlier `clsplat bench --json`"
+EXPECTED_FILE = "the JSON of an earlier `clsplat bench --json`"
 UNITS: dict[str, str] = {"gflops": "GFLOP/s", "gexp": "Gexp/s", "gbytes": "GB/s"}
 TOTALS = {"host": "host", "step": "step", "steps without waits": "steps", "densify": "densify"}  # row labels and keys
 MAX_PEAK_RATIO = 1.1  # largest ratio of two peaks for times to be comparable
@@ -50,13 +50,13 @@ class _EarlierMeasurement(BaseModel):
 def read_measurement(path: Path, pipeline: str) -> dict[str, Any]:
     """Read the data of an earlier measurement of the same pipeline.  Raises ConfigError."""
     name = load(pipeline).settings.name
-    data = read_json(path, EXPECTED, ConfigError)
+    data = read_json(path, EXPECTED_FILE, ConfigError)
     try:
         actual = _EarlierMeasurement.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
         key_path = ".".join(map(str, first["loc"])) or "the file"
-        raise ConfigError(f"{path}: {key_path}: {first['msg']}; expected {EXPECTED}; create it again") from error
+        raise ConfigError(f"{path}: {key_path}: {first['msg']}; expected {EXPECTED_FILE}; create it again") from error
     if actual.pipeline != name:
         raise ConfigError(f"{path}: expected the pipeline '{name}', got {quote(actual.pipeline)}; measure again")
     return {key: value for key, value in data.items() if key != "against"}  # the baseline of that measurement

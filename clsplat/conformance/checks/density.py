@@ -29,12 +29,12 @@ from clsplat.training.adam import Adam
 
 CHECKS = Checks()
 COUNTS = (1, 15, 17, 65, 200)
-GROWTH = (Clone(size_below=0.01, opacity="shared"), SplitLarge(size_above=0.01))
-RULES = (*GROWTH, PruneFaint(opacity_below=0.005), PruneLarge(size_above=0.1))
+GROWTH_RULES = (Clone(size_below=0.01, opacity="shared"), SplitLarge(size_above=0.01))
+RULES = (*GROWTH_RULES, PruneFaint(opacity_below=0.005), PruneLarge(size_above=0.1))
 EXTENT = 5.0
 SEED, STEP = 3, 3100
 SPLAT_XX = int(constants("splat.h")["SPLAT_XX"])
-COLUMNS = ("screen_grad", "screen_grad_abs_sum", "rendered_texture", "screen_radius", "blend_weight", "gain")
+STATISTIC_NAMES = ("screen_grad", "screen_grad_abs_sum", "rendered_texture", "screen_radius", "blend_weight", "gain")
 
 
 @CHECKS.add(
@@ -47,7 +47,7 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
         case.parameters["means"][1::4] -= 20 * case.view.world_to_camera[2, :3]  # behind the camera
         model, (width, height) = case.model(device), case.size
         frame = Rasterizer(device, "radix").forward(model, case.device_camera(device), device.zeros(3))
-        gaussians, stats = model.gaussians, SplatStats(model.gaussians, COLUMNS)
+        gaussians, stats = model.gaussians, SplatStats(model.gaussians, STATISTIC_NAMES)
         planes = rng.normal(size=(stats.pixel_sums, gaussians.capacity)).astype(np.float32)
         planes[ABS_X:] = np.abs(planes[ABS_X:])
         image = frame.image.get()[:, :height, :width]

@@ -38,7 +38,7 @@ CHECKS = Checks()
 CULLED = 0xFFFFFFFF  # depth key
 COUNTS = (1, 15, 17, 65)
 FILTERS = ((0.3, 1.0), (0.1, 1.0), (0.0, 0.0))  # variance, compensate
-ASPECTS = 30, 70, 150  # of long splats on the screen
+ASPECT_RATIOS = 30, 70, 150  # of long splats on the screen
 LONG_FILTERS: dict[str, dict[str, float]] = {
     "dilation": {"variance": 0.3},
     "ewa": {"variance": 0.3, "compensate": 1.0},
@@ -272,7 +272,7 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Res
 @CHECKS.add("project_backward")
 def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
     """Compare the gradients of long splats in a blended image.  Unstable formulas lose most digits there."""
-    for aspect in ASPECTS:
+    for aspect in ASPECT_RATIOS:
         for name, settings in LONG_FILTERS.items():
             case = needle_case(rng, 12, aspect, **settings)
             yield from check_long_splats(device, case, rng, f"needles of {aspect} to 1, filter {name}")

@@ -157,10 +157,10 @@ def _max_alpha(frame: Frame, case: Case) -> tuple[NDArray[Any], NDArray[Any]]:
 
 # Splats that reach more tiles than a mask has bits; the items of a group share the work on their rectangles.
 
-TALL = (3, 130)  # tiles: two or three rows for each of 64 items, none for the last
+TALL_RECTANGLE = (3, 130)  # tiles: two or three rows for each of 64 items, none for the last
 MASK_SIZED = ((8, 4), (11, 3))  # tiles: as many as a mask has bits, and one more
-SURPLUS = (-7, -1, 5)  # errors in a count, as another compiler might cause
-UNTOUCHED = 0xDEADBEEF
+COUNT_ERRORS = (-7, -1, 5)  # errors in a count, as another compiler might cause
+UNTOUCHED_VALUE = 0xDEADBEEF
 
 
 def large_case(device: Device, rng: np.random.Generator, columns: int, rows: int, count: int = 6) -> Case:
@@ -183,10 +183,10 @@ def lists_of_large_splats(device: Device, rng: np.random.Generator) -> Results:
 
 def check_large(device: Device, rng: np.random.Generator) -> Results:
     """Check tile lists for many rows of tiles, for splats that reach about 32 tiles, and for wrong counts."""
-    for columns, rows in (TALL, *MASK_SIZED):
+    for columns, rows in (TALL_RECTANGLE, *MASK_SIZED):
         case, label = large_case(device, rng, columns, rows), f"large Gaussians, {columns} x {rows} tiles"
         yield from check_list(device, case, "radix", label)
-    yield from check_wrong_counts(device, large_case(device, rng, *TALL))
+    yield from check_wrong_counts(device, large_case(device, rng, *TALL_RECTANGLE))
 
 
 def check_wrong_counts(device: Device, case: Case) -> Results:
@@ -197,10 +197,10 @@ def check_wrong_counts(device: Device, case: Case) -> Results:
     box = rasterizer.workspace.array("tile_box", gaussian_count, np.uint32)
     actual = frame.lists.tile_count.get()[:gaussian_count].astype(int)
     is_large = (box.get() >> 24 == 33) & (actual > 0)
-    for extra in SURPLUS:
+    for extra in COUNT_ERRORS:
         counts = np.where(is_large, np.maximum(1, actual + extra), 0)
         offsets = np.concatenate([[0], np.cumsum(counts)])
-        arrays = [device.upload(np.full(offsets[-1] + 64, UNTOUCHED, np.uint32)) for _ in range(2)]
+        arrays = [device.upload(np.full(offsets[-1] + 64, UNTOUCHED_VALUE, np.uint32)) for _ in range(2)]
         device.program("large.cl").emit_large(
             groups=1,
             splats=frame.splats,
@@ -220,9 +220,9 @@ def check_wrong_counts(device: Device, case: Case) -> Results:
         tile, splat = (array.get() for array in arrays)
         label = f"large Gaussians counted with {extra:+d} tiles"
         owner = np.repeat(np.arange(gaussian_count), counts)
-        yield match("emit_large", f"splats of {label}", splat, np.append(owner, np.full(64, UNTOUCHED)))
+        yield match("emit_large", f"splats of {label}", splat, np.append(owner, np.full(64, UNTOUCHED_VALUE)))
         yield count_true("emit_large", f"tiles outside, {label}", tile[: len(owner)] >= camera.tiles)
-        yield match("emit_large", f"values after {label}", tile[len(owner) :], UNTOUCHED)
+        yield match("emit_large", f"values after {label}", tile[len(owner) :], UNTOUCHED_VALUE)
         pairs = np.stack([owner, tile[: len(owner)]], axis=1)
         duplicate_count = len(pairs) - len(np.unique(pairs, axis=0)) - int(np.maximum(0, counts - camera.tiles).sum())
         yield Deviation("emit_large", f"tiles listed twice, {label}", max(0, duplicate_count), 0, counts=True)

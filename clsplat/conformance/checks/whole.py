@@ -32,8 +32,8 @@ MAX_TRAINING_S = 40.0  # time after which a slow device stops early
 MEMORY_FRACTION = 0.25  # of free memory to use, since device and host may share it and must not swap
 FIRST_BUFFER = 128 << 20  # bytes
 MAX_WRITE_S = 4.0  # longest time to write a buffer
-IN_USE = "other programs may use the device's memory; close them and run `clsplat doctor` again"
-BENCH = (256, 256, 20_000)  # width, height, Gaussians
+DEVICE_IN_USE = "other programs may use the device's memory; close them and run `clsplat doctor` again"
+BENCH_SIZE = (256, 256, 20_000)  # width, height, Gaussians
 
 
 def _render_photograph(device: Device, case: Case) -> Photograph:
@@ -107,7 +107,7 @@ def memory(device: Device, rng: np.random.Generator) -> Results:
         try:
             yield from _check_buffer(device, size)
         except MemoryLimitError:
-            end_reason = f"a buffer of {size / 2**20:,.0f} MiB cannot be allocated: {IN_USE}"
+            end_reason = f"a buffer of {size / 2**20:,.0f} MiB cannot be allocated: {DEVICE_IN_USE}"
             break
         tested_size, size = size, min(2 * size, limit)
         if 2 * (time.perf_counter() - start) > MAX_WRITE_S and size > tested_size:
@@ -153,6 +153,6 @@ def yardsticks(device: Device, rng: np.random.Generator) -> Results:
 @SPEED.add()
 def speed(device: Device, rng: np.random.Generator) -> Results:
     peaks = measure_peaks(device, repeats=2)
-    bench = make_case(device, *BENCH, load("splat").settings)
+    bench = make_case(device, *BENCH_SIZE, load("splat").settings)
     result = run_bench({"": bench}, Peaks(**asdict(peaks)), repeats=5)[""]
-    yield Note("speed", {"scene": BENCH, "peaks": asdict(peaks), **asdict(result)})
+    yield Note("speed", {"scene": BENCH_SIZE, "peaks": asdict(peaks), **asdict(result)})

@@ -18,8 +18,8 @@ from clsplat.conformance.reference.types import PinholeCamera, RawGaussians, Spl
 Floats = NDArray[Any]
 SLOPE, CUBIC, QUINTIC = 1.5957691, 0.07333173, -0.00059424  # Φ(x) = 1 / (1 + e^-P), P = SLOPE x + CUBIC x³ + …
 REACH = 6.0  # standard deviations beyond which Φ is constant
-UNIFORM = 0.4  # half a pixel, in standard deviations, below which mean and variance are computed as series
-STEP = 1e-5  # step of finite differences, px or px², relative to the size of the splat
+SERIES_BELOW = 0.4  # half a pixel, in standard deviations, below which mean and variance are computed as series
+DIFFERENCE_STEP = 1e-5  # step of finite differences, px or px², relative to the size of the splat
 
 
 def cdf(x: Floats) -> Floats:
@@ -43,7 +43,7 @@ def moments(dy: Floats, s: float) -> tuple[Floats, Floats, Floats]:
     """
     low, high = -(dy + 0.5) / s, -(dy - 0.5) / s  # mirrored to the side where Φ is small and precise
     mass = np.maximum(cdf(high) - cdf(low), 1e-30)
-    if 0.5 / s < UNIFORM:
+    if 0.5 / s < SERIES_BELOW:
         tilt = dy / s**2
         mean = dy - tilt * (1 / 12 - 1 / (360 * s**2) - tilt**2 / 720)
         return mass, mean, np.maximum(1 / 12 - 1 / (360 * s**2) - tilt**2 / 240, 0)
@@ -80,8 +80,8 @@ def box_derivatives(covariance: Floats, dx: Floats, dy: Floats) -> tuple[Floats,
         return (values[0] - values[1]) / (2 * step)
 
     xx, xy, yy = covariance
-    distance = STEP * np.sqrt(xx - xy * xy / yy)
-    area = STEP * (xx * yy - xy * xy) / max(xx, yy)
+    distance = DIFFERENCE_STEP * np.sqrt(xx - xy * xy / yy)
+    area = DIFFERENCE_STEP * (xx * yy - xy * xy) / max(xx, yy)
     return (
         difference(distance, x=1),
         difference(distance, y=1),

@@ -139,7 +139,7 @@ def masked_mean(image: NDArray[Any], reach: int, falloff: float, mask: NDArray[A
 
 # One level of the Haar transform and its inverse, with a separate high-pass analysis filter, as matrix products.
 
-LOW, HIGH = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
+LOW_PASS, HIGH_PASS = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
 
 
 def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
@@ -147,8 +147,8 @@ def analysis_and_synthesis(length: int, taps: NDArray[Any]) -> NDArray[Any]:
     analysis, synthesis = np.zeros((length, length)), np.zeros((length, length))
     for pair in range(length // 2):
         columns = slice(2 * pair, 2 * pair + 2)
-        analysis[pair, columns], analysis[length // 2 + pair, columns] = LOW, taps
-        synthesis[columns, pair], synthesis[columns, length // 2 + pair] = LOW, HIGH
+        analysis[pair, columns], analysis[length // 2 + pair, columns] = LOW_PASS, taps
+        synthesis[columns, pair], synthesis[columns, length // 2 + pair] = LOW_PASS, HIGH_PASS
     return synthesis @ analysis
 
 

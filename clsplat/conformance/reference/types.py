@@ -12,14 +12,14 @@ RADIUS_TILE = 16  # px, tile of the original visibility test; kernels may use ot
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The thresholds of blending (Kerbl et al. 2023).  `SMOOTH` skips no splat, so images are differentiable."""
+    """The thresholds of blending (Kerbl et al. 2023); SMOOTH_THRESHOLDS skip no splat, so images are differentiable."""
 
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
 
 
-SMOOTH = Thresholds(alpha_min=0.0, transmittance_min=0.0)
+SMOOTH_THRESHOLDS = Thresholds(alpha_min=0.0, transmittance_min=0.0)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from clsplat.training.run import Run
 VIEW_GRIDS = "view_colors.npy"
 ENTRIES = int(constants("color_grid.h")["ENTRIES"])
 TABLES = ("values", "moment1", "moment2")
-WARM_UP = 1000  # steps (gsplat), or a tenth of the steps of a shorter run
+WARM_UP_STEPS = 1000  # steps (gsplat), or a tenth of the steps of a shorter run
 Nodes = Annotated[int, Field(ge=1, le=int(constants("color_grid.h")["MOST_NODES"]))]
 GRID_MEANING = (
     f"{MEANING}; [E | b] is interpolated trilinearly; file: matrices [photographs, luminance, height, width, 3, 4], "
@@ -90,7 +90,7 @@ class BilateralGrid(Appearance):
             return self.rate
         exposure_rate = super().rate_schedule(steps, photographs, is_warm_start)
         rate = Decay(initial=2e-3, final=2e-5, over=steps) if is_warm_start else exposure_rate
-        warm_up = max(1, min(WARM_UP, steps // 10))
+        warm_up = max(1, min(WARM_UP_STEPS, steps // 10))
         knots = [warm_up + round((steps - warm_up) * t) for t in np.linspace(0, 1, 11)]
         points = {step: [float(step), at_step(rate, step)] for step in knots}
         return Points(points=[[0.0, at_step(rate, 0) / 100], *points.values()])

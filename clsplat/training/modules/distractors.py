@@ -29,9 +29,9 @@ from clsplat.training.run import Run
 
 UPDATES = "updates"
 WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # of the learned tables
-NEAR = 0.2  # depth of the near plane, in initial depths
+NEAR_FRACTION = 0.2  # depth of the near plane, in initial depths
 SIZE, OPACITY = 0.5, 0.05  # initial standard deviation, relative to the spacing of the Gaussians; initial opacity
-GOLDEN = (5**0.5 - 1) / 2
+GOLDEN_RATIO = (5**0.5 - 1) / 2
 # A short run visits each photograph only a few dozen times, so rates are larger than those of the scene (our choice).
 RATES = Rates(means=2e-3, quats=2e-3, log_scales=2e-2, logit_opacity=0.1, sh_base=2e-2, sh_rest=0.0).at(0, 1.0)
 
@@ -107,7 +107,7 @@ class DistractorsState(ModuleState):
         if step.view_index is None or step.number <= self.settings.start:
             return
         camera, gaussians = step.camera, self.adams[self._rows[step.view_index]].gaussians
-        model = replace(step.model, gaussians=gaussians, degree=0, near=NEAR, sky=None, dropout=None)
+        model = replace(step.model, gaussians=gaussians, degree=0, near=NEAR_FRACTION, sky=None, dropout=None)
         moved_camera = move_camera(self.rasterizer.workspace, camera, np.eye(3, 4))
         frame = self.rasterizer.forward(model, moved_camera, self._black)
         scale = at_step(self.settings.cover, step.number) / (camera.width * camera.height)
@@ -145,7 +145,7 @@ def initial_tables(count: int, photographs: Sequence[tuple[View, NDArray[np.uint
 def _spread_gaussians(count: int, view: View, pixels: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     """Return Gaussians on a Fibonacci lattice, one unit of length in front of a camera."""
     camera, index = view.camera, np.arange(count) + 0.5
-    x, y = camera.width * index / count, camera.height * ((index * GOLDEN) % 1)
+    x, y = camera.width * index / count, camera.height * ((index * GOLDEN_RATIO) % 1)
     colors = pixels[y.astype(int), x.astype(int)] / 255
     size = SIZE * np.sqrt(camera.width * camera.height / count / (camera.fx * camera.fy))
     return {

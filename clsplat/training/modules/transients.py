@@ -20,7 +20,7 @@ from clsplat.training.run import Run
 _CONSTANTS = constants("transients.cl")
 BINS, FIRST_BIN, BIN_SHIFT = (int(_CONSTANTS[name]) for name in ("BINS", "FIRST_BIN", "BIN_SHIFT"))
 KEYS = tuple(f"{k:02d}" for k in range(BINS))
-TAIL = 0.99  # quantile by which outliers are detected
+OUTLIER_QUANTILE = 0.99  # quantile by which outliers are detected
 
 
 class Transients(TrainingModule):
@@ -60,7 +60,7 @@ class Transients(TrainingModule):
         counts = np.cumsum([scalars.get(key, 0.0) for key in KEYS])
         if step <= self.start or counts[-1] == 0:
             return None
-        typical, tail = (_bin_end(int((counts < q * counts[-1]).sum())) for q in (self.quantile, TAIL))
+        typical, tail = (_bin_end(int((counts < q * counts[-1]).sum())) for q in (self.quantile, OUTLIER_QUANTILE))
         return self.outlier_ratio * typical if tail > self.tail_ratio * typical else None
 
     def create_state(self, run: Run) -> ModuleState:
