@@ -47,7 +47,7 @@ void measure_residuals(
             atomic_add(numbers + k, row_counts[k]);
 }
 
-/* Write the mask: 1 in pixels whose residual is below a threshold, or where at least half of the residuals in the box
+/* Write the mask: 1 in pixels whose residual is below a threshold, or where at least 50 % of the residuals in the box
  * around the pixel are below it; else 0.  One item = one pixel; dimension 1 is the row. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void mask_transients(

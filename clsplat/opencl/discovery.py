@@ -57,7 +57,7 @@ class DeviceInfo:
         return runtimes.probe_fault(f"{self.platform}|{self.name}|{self.driver}|{cl.VERSION_TEXT}", *self.index)
 
     def matches(self, device_name: str) -> bool:
-        """Return whether the text of platform, name, and kind contains `device_name`, ignoring case."""
+        """Return whether "PLATFORM NAME KIND" of this device contains `device_name`, ignoring case."""
         return device_name.lower() in f"{self.platform} {self.name} {self.kind}".lower()
 
 

@@ -42,7 +42,7 @@ class StepScaling:
         return cls(exact, Fraction(math.ceil(exact * STEP_PARTS), STEP_PARTS))
 
     def scale(self, step: int) -> int:
-        """Return a stretched step."""
+        """Return the stretched step that `step` becomes, at most MAX_STEP."""
         return min(math.floor(step * self.factor), MAX_STEP)
 
     def scale_interval(self, every: float) -> float:
@@ -71,9 +71,8 @@ class StepScaling:
     def scale_until(self, until: int, every: float) -> int:
         """Return the stretched `until`, with the same number of actions before it."""
         number = count_fired(every, until - 1)
-        return max(
-            1, min(max(self._action_step(every, number) + 1, self.scale(until)), self._action_step(every, number + 1))
-        )
+        first, last = self._action_step(every, number) + 1, self._action_step(every, number + 1)
+        return max(1, min(max(first, self.scale(until)), last))
 
     def _action_step(self, every: float, number: int) -> int:
         return math.floor(number * Fraction(str(every)) * self.factor)

@@ -72,9 +72,8 @@ class ValidatedTraining(Training):
         if self.keep == "last":
             return []
         validating_stage = next((stage for stage in during if _validates(stage)), None)
-        count = max(
-            1, min(MAX_EVALUATIONS, self.steps // MIN_INTERVAL)
-        )  # equal intervals, so that the last step is measured
+        # equal intervals, so that the last step is measured
+        count = max(1, min(MAX_EVALUATIONS, self.steps // MIN_INTERVAL))
         every = validating_stage.every if validating_stage else self.steps // count
         start, stop = (validating_stage.start, validating_stage.stop) if validating_stage else (0, None)
         keys = {"metrics": [*PSNR_AND_SSIM], "every": every}

@@ -294,7 +294,8 @@ class RoundTables(Stage):
     """Step of positions, as a fraction of the size of each Gaussian (the geometric mean of three standard deviations);
     larger for Gaussians of little weight."""
     quats: Levels | None = None
-    """Step of rotations, in 8-bit levels; axes are permuted so that the rotation of each Gaussian is minimal."""
+    """Step of rotations, in 8-bit levels.  The axes of each Gaussian are first permuted so that its rotation is
+    minimal."""
     log_scales: Step | None = None
     """Step of the logarithms of standard deviations."""
     sh_base: Step | None = None

@@ -226,7 +226,9 @@ def _flatten_samples(table: NDArray[np.float32]) -> NDArray[np.float64]:
 def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, positions: NDArray[np.float32]) -> Results:
     shape, encoding, tiles = case.shape, case.levels.encoding, len(positions)
     assert shape.grid is not None
-    label = f"{tiles} tiles, {shape.grid.levels} levels to {shape.grid.finest} with {shape.grid.entries}"
+    label = (
+        f"{tiles} tiles, {shape.grid.levels} levels of up to {shape.grid.finest} cells and {shape.grid.entries} entries"
+    )
     encoding.grid_positions(tiles).set(positions)
     encoding.read_grid(case.device_parameters, tiles)
     table, first = case.levels.network.position(tiles)

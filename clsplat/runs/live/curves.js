@@ -2,7 +2,7 @@
 
 const LOSS = 1, PSNR = 2, COUNT = 3; // indices in a point, after its step
 const short = value => value >= 1e6 ? `${(value / 1e6).toFixed(2)} M` : formatCount(value);
-const SHOWN = {loss: [LOSS, v => v.toPrecision(3)], psnr: [PSNR, v => v.toFixed(1)], gaussians: [COUNT, short]};
+const CURVES = {loss: [LOSS, v => v.toPrecision(3)], psnr: [PSNR, v => v.toFixed(1)], gaussians: [COUNT, short]};
 
 class Curves {
   constructor() { this.clear(); }
@@ -22,7 +22,7 @@ class Curves {
 
   draw() {
     const first = this.points[0]?.[0], span = this.last - first || 1;
-    for (const [name, [place, text]] of Object.entries(SHOWN)) {
+    for (const [name, [place, text]] of Object.entries(CURVES)) {
       const points = this.points.filter(point => point[place] !== null); // a field has no Gaussians
       const values = points.map(point => point[place]), low = Math.min(...values), high = Math.max(...values);
       const line = points.map((point, i) => {

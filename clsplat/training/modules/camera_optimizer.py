@@ -73,11 +73,11 @@ class CameraOptimizer(TrainingModule):
     rotation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
     """Learning rate of rotations, rad; may be scheduled.  auto: 0.3 times the automatic rate of translations."""
     translation: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = "auto"
-    """Learning rate of translations, relative to the median depth; may be scheduled.  auto: 2e-4 to 2e-6; with few
-    visits per photo, larger, so that a photo's rates add up to 0.01, but at most 2e-3."""
+    """Learning rate of translations, relative to the median depth; may be scheduled.  auto: decays from 2e-4 to
+    2e-6; if photos have few visits, it starts at up to 2e-3, so that the rates of each photo add up to 0.01."""
     focal: Annotated[Literal["auto"] | NonNegative, explain_schedule(", or auto")] = 0.0
-    """Learning rate of the logarithms of focal lengths; may be scheduled; 0: fixed.  auto: 1e-4 to 1e-6; with few
-    visits per camera, larger, so that a camera's rates add up to 0.2, but at most 1e-3."""
+    """Learning rate of the logarithms of focal lengths; may be scheduled; 0: fixed.  auto: decays
+    from 1e-4 to 1e-6; if cameras have few visits, it starts at up to 1e-3, so that the rates of each add up to 0.2."""
     start: Annotated[int, Field(ge=0)] = 500
     """Global step after which poses are optimized; before it, the model is too blurry to align cameras."""
 

@@ -127,7 +127,7 @@ class DistractorsState(ModuleState):
 
     def update(self, step: TrainingStep) -> None:
         if (saved := step.saved_value(self)) and step.view_index is not None:
-            frame, pixel_sums = saved[1]
+            _, (frame, pixel_sums) = saved  # of `backward`
             self.adams[self._rows[step.view_index]].update(frame.model, frame, pixel_sums, RATES)
 
 

@@ -88,12 +88,12 @@ def _choose(background: Auto, run: Run) -> tuple[Literal["on", "off"], str]:
     if reason := _explain_unknown(run):
         return "off", reason
     sky_count, count = _count_skies(run, background.share)
+    is_sky = sky_count >= background.photographs * count
     text = (
         f"{sky_count} of {count} photos show bright or blue regions above the horizon, without points, in "
-        f"{background.share:.0%} or more of their upper third"
+        f"{background.share:.0%} or more of their upper third; a sky needs {background.photographs:.0%} of the photos"
     )
-    is_sky = sky_count >= background.photographs * count
-    return ("on" if is_sky else "off"), f"{text}; {'' if is_sky else 'not '}{background.photographs:.0%} of them"
+    return ("on" if is_sky else "off"), text
 
 
 def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
