@@ -65,7 +65,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
 
 
 def _read_frame_indices(out: Path, settings: dict[str, Any]) -> list[int] | None:
-    """Return the frame indices that an earlier call with the same settings chose, or None.
+    """Return the frame indices that an earlier call with the same settings chose, or None without such a call.
 
     Raises DataError if the folder contains frames of another video or of other settings, or other images.
     """

@@ -297,7 +297,7 @@ def _has_gaussians(extensions: dict[str, Any]) -> bool:
 
 
 def _spz_view(extensions: dict[str, Any]) -> Any:
-    """Return the buffer view that contains an SPZ file, under any draft name of the extension, or None."""
+    """Return the buffer view that contains an SPZ file, under any draft name of the extension; None without one."""
     return next((extension["bufferView"] for name, extension in extensions.items() if "spz" in name), None)
 
 

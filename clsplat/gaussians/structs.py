@@ -45,7 +45,7 @@ class GaussianTables(Protocol):
 
     @property
     def on_host(self) -> Any:
-        """The tables in host memory (`HostTables`), or None."""
+        """The tables in host memory (`HostTables`), or None if all are on the device."""
 
     def __getitem__(self, name: str) -> Array: ...
 

@@ -73,8 +73,10 @@ class ShuffleOrder(Order):
 
 
 class StackOrder(Order):
-    """Draw a random view of the finest size in 30 % of the steps, and any view in the other steps: 47.5, 17.5, 17.5,
-    and 17.5 % of the steps for four sizes (the released code of Mip-Splatting)."""
+    """Draw a random view of the finest size in 30 % of the steps, and of any size in the others (Mip-Splatting).
+
+    With four sizes, the finest gets 47.5 % of the steps, and each of the others 17.5 %.
+    """
 
     type: Literal["stack"] = "stack"
 

@@ -209,8 +209,8 @@ def photo_folder(scene: Path) -> Path:
     """
     if not has_pipeline(scene):
         return scene
-    note = read_summary(scene)
-    folder = Path(note["folder"]) if note else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
+    summary = read_summary(scene)
+    folder = Path(summary["folder"]) if summary else load_pipeline(str(scene / PIPELINE)).settings.scene.folder
     if not folder.is_dir():
         raise DataError(f"{scene}: the folder of its photos, {folder}, is missing; pass the folder of the scene")
     return folder

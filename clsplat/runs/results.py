@@ -100,8 +100,8 @@ class RunFolder:
     @property
     def photo_folder(self) -> Path:
         """The folder of the photos that the run trained on.  Raises ConfigError if the pipeline names no scene."""
-        note = read_summary(self.path)
-        return Path(note["folder"]) if note else self.scene.folder
+        summary = read_summary(self.path)
+        return Path(summary["folder"]) if summary else self.scene.folder
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:

@@ -390,7 +390,7 @@ class Lens:
     def visible_pixels(self) -> NDArray[np.bool_]:
         """A mask, [H, W], of the pixels of `pinhole` that the photograph covers.
 
-        The ray of such a pixel maps into the photograph, and `undistort` maps it back.
+        A pixel is covered if `distort` maps it into the photograph and `undistort` maps the result back to the pixel.
         """
         if self.is_wide:
             return np.concatenate([self._is_visible(u, v) for _, u, v in self._blocks(1)])

@@ -181,7 +181,7 @@ def _without_photos(model: Path, plan: LodPlan, device: Any, reason: str) -> Mod
 
 
 def _photo_error(run: Path) -> DataError | None:
-    """Return the error that reading the photos of a run raises, or None."""
+    """Return the error that reading the photos of a run raises, or None if it succeeds."""
     try:
         read_scene(photo_folder(run))
     except DataError as error:

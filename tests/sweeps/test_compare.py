@@ -246,7 +246,7 @@ def test_crops_show_where_runs_differ(make_run, monkeypatch):
     for crop in result:
         assert 20 <= crop.x <= 28, "from the middle to the right"
         assert 20 <= crop.y <= 28
-        assert crop.frame == {"left": crop.x / 0.4, "top": crop.y / 0.4, "width": 32.5, "height": 32.5}
+        assert crop.percentages == {"left": crop.x / 0.4, "top": crop.y / 0.4, "width": 32.5, "height": 32.5}
         same, darker = crop.psnrs
         assert (same, darker) == (100, pytest.approx(12.6, abs=0.2)), "20 log10(255 / 60)"
         np.testing.assert_array_equal(crop.renders[0], crop.photograph)

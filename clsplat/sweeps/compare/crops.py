@@ -48,7 +48,7 @@ class ImageCrop:
         return [psnr(render, self.photograph) for render in self.renders]
 
     @property
-    def frame(self) -> dict[str, float]:
+    def percentages(self) -> dict[str, float]:
         """The left, top, width, and height of the crop, as percentages of the image size."""
         height, width = self.full_photograph.shape[:2]
         fractions = {

@@ -400,7 +400,7 @@ def _crop_values(crop: ImageCrop) -> dict[str, Any]:
     return dict(
         view=crop.view,
         overview=data_url(crop.overview),
-        frame=crop.frame,
+        percentages=crop.percentages,
         photograph=data_url(crop.photograph, ".png"),
         renders=[data_url(image, ".png") for image in crop.renders],
         psnrs=crop.psnrs,
