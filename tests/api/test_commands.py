@@ -45,7 +45,7 @@ def without_times(text: bytes | str) -> str:
     return re.sub(r'"(train_seconds|cpu_seconds|ms)": [\d.e-]+|"(stages|seconds)": \{[^}]*\}', "", text)
 
 
-def test_run(runs):
+def test_run_function_writes_the_files_of_the_command(runs):
     by_command, by_function = map(contents, runs)
     assert by_command.keys() == by_function.keys()
     exact = [name for name in by_command if name.endswith((".ply", ".png", "pipeline.yaml"))]
@@ -88,7 +88,7 @@ def test_resume_and_dry_run(runs, tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["png", "npy"])
-def test_renders(runs, tmp_path, kind):
+def test_render_function_writes_the_files_of_the_command(runs, tmp_path, kind):
     command("render", runs[0], "--out", tmp_path / "command", "--format", kind, "--scale", 2)
     assert clsplat.render_views(runs[0], out=tmp_path / "function", format=kind, downscale=2) == 2
     assert sorted(contents(tmp_path / "command")) == [".renders.json", *(f"test/r_00{i}.{kind}" for i in (0, 1))]
@@ -102,7 +102,7 @@ def test_rendered_files_match_the_renderer(runs, tiny_scene, tmp_path):
         np.testing.assert_array_equal(np.load(tmp_path / f"{view.name}.npy"), renderer.render(view).image)
 
 
-def test_json(runs, tiny_scene):
+def test_functions_return_what_commands_print_as_json(runs, tiny_scene):
     pairs = {
         f"evaluate {runs[0]} --json --downscales 1,2": lambda: clsplat.evaluate(runs[0], downscales=[1, 2]),
         f"evaluate {runs[0]}/point_cloud.ply --json --scene {tiny_scene}": lambda: clsplat.evaluate(
@@ -121,7 +121,7 @@ def test_json(runs, tiny_scene):
         assert command(*arguments.split()) == json.dumps(function(), indent=1) + "\n", arguments
 
 
-def test_pages(runs, tiny_scene, tmp_path):
+def test_functions_write_the_pages_of_the_commands(runs, tiny_scene, tmp_path):
     command("compare", *runs, "--out", tmp_path / "a.html")
     assert clsplat.compare_runs(runs, tmp_path / "b.html") == 2
     command("inspect", tiny_scene, "--html", tmp_path / "c.html")
@@ -149,13 +149,13 @@ def test_comparison_without_runs_is_refused(tmp_path):
     assert not (tmp_path / "c.html").exists()
 
 
-def test_copies_of_pipelines(tmp_path):
+def test_function_and_command_copy_the_same_pipeline(tmp_path):
     command("pipelines", "smoke", "--copy", tmp_path / "a.yaml")
     assert clsplat.copy_pipeline("smoke", tmp_path / "b.yaml") == tmp_path / "b.yaml"
     assert (tmp_path / "a.yaml").read_bytes() == (tmp_path / "b.yaml").read_bytes()
 
 
-def test_measurements(runs, tiny_scene, tmp_path):
+def test_speed_measurement_is_read_back_from_json(runs, tiny_scene, tmp_path):
     model = {"model": runs[0] / "point_cloud.ply", "scene": tiny_scene}
     measurement = clsplat.measure_speed([], **model, pipeline="smoke", repeats=1)
     (tmp_path / "bench.json").write_text(json.dumps(measurement.data()))

@@ -166,7 +166,7 @@ def test_trainer_resumes_its_checkpoint_or_the_commands(tiny_scene, tmp_path):
     assert equal(after_command.model, whole.model)
 
 
-def test_temporary_folder_goes_away_with_its_trainer(tiny_scene):
+def test_temporary_folder_is_removed_with_its_trainer(tiny_scene):
     trainer = clsplat.Trainer(tiny_scene, "smoke", set={"optimize.steps": 3})
     trainer.run(2)
     folder = trainer.out
@@ -228,7 +228,7 @@ def test_added_loss_acts_from_the_next_step(tiny_scene):
         (("smoke", {}, None, "resume"), ConfigError, "start='resume': expected a run folder as `out`"),
     ],
 )
-def test_untrainable_input_is_one_sentence(tiny_scene, arguments, error, message):
+def test_untrainable_input_is_refused_in_one_sentence(tiny_scene, arguments, error, message):
     pipeline, settings, out, start = (*arguments, *({}, None, "new")[len(arguments) - 1 :])
     with pytest.raises(error) as raised:
         clsplat.Trainer(tiny_scene, pipeline, set=settings, out=out, start=start)

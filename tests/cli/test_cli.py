@@ -71,14 +71,14 @@ def test_failed_start_is_in_the_status(tmp_path):
     assert "no dataset found" in status["message"]
 
 
-def test_check_and_schema():
+def test_check_validates_a_recipe_and_prints_the_schema():
     assert "splat.yaml: valid; init, optimize" in clsplat("check", "splat").stdout
     assert json.loads(clsplat("check", "--schema").stdout)["properties"]["stages"]
     data = json.loads(clsplat("check", "splat", "--json").stdout)
     assert (data["name"], data["valid"]) == ("splat", True)
 
 
-def test_devices():
+def test_devices_lists_a_working_device():
     assert "schedule" in clsplat("devices").stdout
     devices = json.loads(clsplat("devices", "--json").stdout)
     assert any(device["fault"] is None for device in devices)
@@ -127,7 +127,7 @@ def damaged(scene: Path, folder: Path) -> Path:
     return folder
 
 
-def test_bad_data(tiny_scene, model, tmp_path):
+def test_bad_data_ends_with_exit_code_3(tiny_scene, model, tmp_path):
     missing = damaged(tiny_scene, tmp_path / "missing image")
     (missing / "train" / "r_003.png").unlink()
     assert "r_003.png" in clsplat("run", "smoke", "--scene", missing, "--out", tmp_path / "a", expect=3).stderr
@@ -149,7 +149,7 @@ def test_bad_data(tiny_scene, model, tmp_path):
         assert not (tmp_path / name / "metrics.json").exists()
 
 
-def test_bad_settings(tiny_scene, tmp_path):
+def test_bad_settings_end_with_exit_code_2(tiny_scene, tmp_path):
     out = tmp_path / "out"
     assert "did you mean 'smoke'" in clsplat("run", "smokee", "--scene", tiny_scene, "--out", out, expect=2).stderr
     wrong = ["--set", "optimize.steps=30k"]

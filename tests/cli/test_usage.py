@@ -34,7 +34,7 @@ def finished(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return out
 
 
-def test_version():
+def test_version_option_prints_the_full_version():
     assert clsplat("--version").stdout == f"clsplat {full_version()}\n"
 
 

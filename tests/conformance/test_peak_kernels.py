@@ -8,7 +8,7 @@ from tests.support.devices import on_devices, on_one_setting
 
 
 @on_devices("items", [1, 17, 64, 65])
-def test_multiply_adds(device, items):
+def test_multiply_add_kernel_matches_numpy(device, items):
     lanes, group = (int(device.tuning[name]) for name in ("LANES", "GROUP"))
     whole = -(-items // group) * group
     result = device.empty(whole * lanes)
@@ -20,7 +20,7 @@ def test_multiply_adds(device, items):
 
 
 @on_devices("items", [1, 17, 64, 65])
-def test_exponentials(device, items):
+def test_exponential_kernel_matches_numpy(device, items):
     lanes, group = (int(device.tuning[name]) for name in ("LANES", "GROUP"))
     whole = -(-items // group) * group
     result = device.empty(whole * lanes)

@@ -246,7 +246,7 @@ def test_harmonics_are_orthonormal():
     np.testing.assert_allclose(gram, np.eye(16), atol=1e-14)
 
 
-def test_harmonics_signs():
+def test_harmonics_match_values_computed_by_hand():
     """Orthonormality does not determine signs and order, so compare with hand-computed values for one direction."""
     basis = ref.sh_basis(np.array([2.0, 3.0, 6.0]) / 7, 3)
     # Numerators over 7^l: -y, z, -x | xy, -yz, 2z²-x²-y², -xz, x²-y² | -y(3x²-y²), xyz, ...
@@ -275,7 +275,7 @@ def test_harmonics_gradient(rng):
 # ---- Closed forms and values by hand ------------------------------------------------------------------------------
 
 
-def test_single_isotropic_gaussian():
+def test_isotropic_gaussian_renders_as_a_disc():
     """On the axis the footprint is a disc of variance (f s / z)² + 0.3."""
     scale, depth, opacity, focal = 0.2, 2.5, 0.8, 40.0
     color = np.array([0.9, 0.3, 0.1])
@@ -452,7 +452,7 @@ def test_transmittance_of_the_threshold_itself_does_not_stop():
     assert transmittance[0, 0] == 0.25
 
 
-def test_margin():
+def test_margin_matches_values_computed_by_hand():
     """The second splat is too faint, the third stops the pixel, so that the fourth does not count."""
     splats = flat_splats(depth=[1, 1.25, 2, 3], opacity=[0.5, 0.02, 0.9, 0.0301], color=np.ones((4, 3)))
     thresholds = ref.Thresholds(alpha_min=0.03, alpha_max=0.99, transmittance_min=0.08)
@@ -483,7 +483,7 @@ def test_margin():
         ({"logit_opacity": [np.nan]}, False),
     ],
 )
-def test_culling(change, visible):
+def test_gaussians_nearer_than_the_near_plane_are_culled(change, visible):
     gaussians = replace(isotropic([0, 0, 2], 0.1, 0.5, [1, 1, 1]), **change)
     splats = ref.project(gaussians, simple_camera(), 0, near=0.5)
     assert splats.visible[0] == visible
@@ -548,7 +548,7 @@ def test_loss_gradients(rng, function):
     assert error <= FD_TOLERANCE, f"{function.__name__}: worst relative error {error:.1e}"
 
 
-def test_loss_values():
+def test_losses_match_values_computed_by_hand():
     x, y = np.zeros((3, 2, 2)), np.zeros((3, 2, 2))
     x[1, 0, 1] = 0.6
     np.testing.assert_allclose(ref.l1(x, y)[0], 0.6 / 12)
@@ -557,7 +557,7 @@ def test_loss_values():
     np.testing.assert_allclose(ref.psnr(np.full((3, 2, 2), 0.1), y), 20)
 
 
-def test_ssim_taps():
+def test_ssim_taps_match_the_published_ones():
     """Against the published numbers."""
     published = [0.00102838, 0.00759876, 0.03600077, 0.10936069, 0.21300554, 0.26601172]
     np.testing.assert_allclose(ref.ssim_taps(), published + published[4::-1], atol=5e-9)
@@ -626,7 +626,7 @@ def test_screen_gradient_and_its_mean():
     np.testing.assert_allclose(ref.mean_gradient(np.array([6.0, 3.0, 0.0]), np.array([4, 1, 0])), [1.5, 3, 0])
 
 
-def test_density_actions():
+def test_density_action_follows_from_the_thresholds():
     """Extent 10: dense is 0.1, too large is 1."""
     cases = [  # gradient, largest scale, opacity, prune_large, action
         (1.9e-4, 0.05, 0.5, False, ref.KEEP),
@@ -658,7 +658,7 @@ def test_density_actions_of_absgs():
     assert actions.tolist() == [ref.CLONE, ref.KEEP, ref.KEEP, ref.SPLIT]
 
 
-def test_opacity_reset():
+def test_opacity_reset_only_lowers_opacities():
     def opacity(logit):
         return 1 / (1 + np.exp(-logit))
 

@@ -211,7 +211,7 @@ def test_killed_start_does_not_change_the_default_folder(tmp_path):
     assert find_free_folder(tmp_path / "splat", None, "new").out == tmp_path / "splat"
 
 
-def test_folder_that_another_thread_is_locking_is_held(tmp_path, monkeypatch):
+def test_folder_that_another_thread_is_locking_is_locked(tmp_path, monkeypatch):
     """Without locks, it would look like a leftover of an earlier process with the same ID."""
     locked, waiting, go_on = lock._acquire, threading.Event(), threading.Event()
 

@@ -151,7 +151,7 @@ def test_extraction_resumes_after_a_kill(video, tmp_path, monkeypatch):
     assert contents(tmp_path / "frames") == contents(tmp_path / "whole")
 
 
-def test_not_a_video(tmp_path):
+def test_files_that_are_not_videos_are_refused(tmp_path):
     (tmp_path / "v.mp4").write_text("nothing")
     assert "not a video that OpenCV decodes" in refusal(write_frames, tmp_path / "v.mp4", tmp_path / "out")
     assert "No such file" in refusal(write_frames, tmp_path / "w.mp4", tmp_path / "out")
@@ -166,7 +166,7 @@ def test_image_is_refused_as_a_video(tmp_path):
 
 
 @pytest.mark.parametrize(("values", "parts", "chosen"), [([1, 3, 2], 9, [0, 1, 2]), ([2, 2, 1, 5], 2, [0, 3])])
-def test_sharpest(values, parts, chosen):
+def test_sharpest_frame_of_each_segment_is_chosen(values, parts, chosen):
     assert sharpest(values, [0.0] * len(values), parts) == chosen
 
 

@@ -82,7 +82,7 @@ def quietly(source: WebArchive, out: Path) -> list[str]:
     return lines
 
 
-def test_fetched(web, tmp_path):
+def test_archive_is_downloaded_only_once(web, tmp_path):
     folder, address, server = web
     checksum = archive(folder / "d.zip")
     quietly(WebArchive(f"{address}/d.zip", "free", checksum), tmp_path / "data" / "d")
@@ -113,7 +113,7 @@ def test_partial_download_is_kept_after_retries(web, tmp_path):
     assert server.asked[-1] == "bytes=5000-"
 
 
-def test_wrong_checksum(web, tmp_path):
+def test_archive_with_a_wrong_checksum_is_refused(web, tmp_path):
     folder, address, _ = web
     archive(folder / "d.zip")
     message = refusal(quietly, WebArchive(f"{address}/d.zip", "free", "0" * 64), tmp_path / "d")

@@ -220,7 +220,7 @@ def test_unexpected_pickles_are_refused(data, reason, capsys):
     assert not capsys.readouterr().out
 
 
-def test_wrong_files_end_in_a_sentence(tmp_path):
+def test_wrong_files_are_refused_in_one_sentence(tmp_path):
     (tmp_path / "other.tar.gz").write_bytes(b"truncated")
     for out, source, code in (
         ("lpips.onnx", "other.tar.gz", 3),

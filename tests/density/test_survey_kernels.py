@@ -148,7 +148,7 @@ def test_errors_and_losses_use_counted_pixels_only(device, rng, masked):
     np.testing.assert_array_equal(look.sum(WEIGHT), before)
 
 
-def test_views_are_drawn_by_seed_and_step():
+def test_views_are_sampled_by_seed_and_step():
     views = list(range(25))
 
     def drawn(number: int, seed: int, step: int) -> list[int]:

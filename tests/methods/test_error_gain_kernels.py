@@ -144,7 +144,7 @@ def test_invisible_gaussians_do_not_grow(device):
 
 
 @on_devices("count", [0, 1, 2])
-def test_few_gaussians(device, count):
+def test_gain_is_computed_for_up_to_two_gaussians(device, count):
     stats = stats_of(device, count, 1.0, [L1()])
     assert len(stats.mean("gain")) == count
     assert rows_of(stats, "gain", 1e-30) == [1, 2][:count]  # the first one is behind the camera

@@ -225,7 +225,7 @@ def test_filter_follows_the_same_course_in_fewer_steps():
 
 @pytest.mark.slow
 def test_recipe_trains(tiny_scene, tmp_path):
-    """The filter leaves zero at its rate, and measured is what photographs are."""
+    """The filter grows from zero at its rate, and evaluation uses the unfiltered photographs."""
     short = ("optimize.steps=30", "optimize.evaluate.every=30", "checkpoint.every=30", "optimize.log_every=10")
     run = train(tiny_scene, tmp_path / "run", *short, pipeline="auto_opti3dgs_7k")
     scalars = run.modules["haar"].scalars

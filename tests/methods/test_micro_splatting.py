@@ -64,7 +64,7 @@ def test_narrow_logarithmic_axis_has_tick_labels():
     assert re.findall(r'text-anchor="end">([\d.]+)<', chart) == ["1.2", "1.4", "1.6"]
 
 
-def test_exact_resume(finished, tiny_scene, tmp_path):
+def test_resumed_run_has_the_same_bits(finished, tiny_scene, tmp_path):
     whole = (finished.out / "point_cloud.ply").read_bytes()
     again = shutil.copytree(finished.out, tmp_path / "again")
     for step in (30, 40, 50):

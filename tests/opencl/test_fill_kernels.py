@@ -15,7 +15,7 @@ from tests.support.devices import each_once, on_devices
         [0, 1, 15, 16, 17, 1023, 1024, 1025], [(np.float32, 0.0), (np.float32, -1.5), (np.uint32, 7), (np.uint32, 0)]
     ),
 )
-def test_fill(device, count, dtype, value):
+def test_fill_sets_every_element(device, count, dtype, value):
     array = device.upload(np.full(count, 3, dtype))
     array.fill(value)
     np.testing.assert_array_equal(array.get(), np.full(count, value, dtype))

@@ -134,7 +134,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_refusals(case, write):
+def test_invalid_matrices_are_refused(case, write):
     text, words = REFUSED[case]
     with pytest.raises(ConfigError, match=words) as error:
         load_experiment(write(text))

@@ -406,7 +406,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_refusals(case, write):
+def test_invalid_pipelines_are_refused(case, write):
     text, words = REFUSED[case]
     with pytest.raises(ConfigError, match=words) as error:
         load(write(text))
@@ -427,7 +427,7 @@ def test_numbers_are_yaml_1_2(write):
     assert data == {"a": 1e-4, "b": "no", "c": 10, "d": 16}
 
 
-def test_overrides(write):
+def test_overrides_change_the_keys_that_they_name(write):
     path = write(SMALL)
     pipeline = load(path, [
         "optimize.steps=500", "model.sh_degree=1", "densify.every=50", "optimize.losses[0].weight=1e-1",

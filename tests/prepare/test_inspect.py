@@ -92,7 +92,7 @@ def test_text_and_binary_models_see_the_same_points(kind):
     assert seen == Inspection.from_folder(folder).facts.points_per_view
 
 
-def test_blender_and_nerfstudio(tiny_scene):
+def test_views_and_points_of_a_blender_scene_are_counted(tiny_scene):
     facts = Inspection.from_folder(tiny_scene).facts
     assert (facts.kind, facts.registered, facts.train, facts.test) == ("Blender", 10, 8, 2)
     assert facts.points.count > 0
@@ -124,7 +124,7 @@ def test_distortion_is_the_displacement_at_the_corner():
 # ---- errors: what the reader refuses too
 
 
-def test_missing_image(scene):
+def test_missing_image_prevents_training(scene):
     (scene / "images" / "03.png").unlink()
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.missing == ["images/03.png"]
@@ -162,7 +162,7 @@ def test_larger_images_of_the_same_shape_are_allowed(tmp_path):
     assert inspection.verdict == "ready to train"
 
 
-def test_unreadable_image(scene):
+def test_unreadable_image_is_an_error(scene):
     (scene / "images" / "05.png").write_bytes(b"\x89PNG\r\n\x1a\nnot really")
     assert "1 image file cannot be decoded (05.png)" in finding_text(Inspection.from_folder(scene), "error")
 
@@ -201,13 +201,13 @@ def test_truncated_file_is_one_error_among_others(scene, stem):
     assert "cannot train" in inspection_page(inspection).lower()
 
 
-def test_photographs_without_poses(tmp_path):
+def test_photographs_without_poses_are_an_error(tmp_path):
     photograph(tmp_path / "a.png")
     inspection = Inspection.from_folder(tmp_path)
     assert "contains 1 photo but no camera poses" in finding_text(inspection, "error")
 
 
-def test_empty_folder(tmp_path):
+def test_folder_without_a_dataset_is_an_error(tmp_path):
     assert "no dataset found" in finding_text(Inspection.from_folder(tmp_path), "error")
     with pytest.raises(DataError, match="no such folder"):
         Inspection.from_folder(tmp_path / "nowhere")
@@ -256,7 +256,7 @@ def test_trainable_means_readable_by_a_reader(tmp_path_factory, kind: str, data:
 # ---- warnings and notes
 
 
-def test_unregistered_image(scene):
+def test_images_without_a_pose_are_reported(scene):
     photograph(scene / "images" / "other.png")
     inspection = Inspection.from_folder(scene)
     assert inspection.facts.unregistered == ["images/other.png"]
@@ -267,7 +267,7 @@ def test_unregistered_image(scene):
     assert Inspection.from_folder(scene).verdict.startswith("trains, but 6 of 30 images on disk have no pose")
 
 
-def test_outlier_camera(tmp_path):
+def test_outlier_camera_is_a_warning(tmp_path):
     model = orbit()
     model = replace(model, images=changed(model.images, 4, translation=(0.0, 0.0, 4000.0)))
     inspection = Inspection.from_folder(write(tmp_path, model))
@@ -277,7 +277,7 @@ def test_outlier_camera(tmp_path):
     assert "far away from all others" in inspection_page(inspection)
 
 
-def test_two_models(scene):
+def test_unused_colmap_models_are_a_warning(scene):
     model = orbit()
     write_model(scene / "sparse" / "1", replace(model, images=model.images[:6]))
     write_model(scene / "sparse" / "2", replace(model, images=model.images[:1]))
@@ -295,7 +295,7 @@ def test_names_that_differ_only_in_case(tmp_path):
     assert inspection.facts.folders == 3
 
 
-def test_equal_poses(tmp_path):
+def test_photographs_with_equal_poses_are_noted(tmp_path):
     model = orbit()
     images = changed(model.images, 1, quaternion=model.images[0].quaternion)
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=images)))
@@ -303,7 +303,7 @@ def test_equal_poses(tmp_path):
     assert "00.png, 01.png have exactly the same pose" in finding_text(inspection, "note")
 
 
-def test_coincident_cameras(tmp_path):
+def test_coincident_cameras_are_a_warning(tmp_path):
     model = orbit()
     images = [replace(model.images[0], name=image.name) for image in model.images]
     assert "all cameras are at the same position" in finding_text(
@@ -354,7 +354,7 @@ def test_views_with_few_points(scene):
     assert "1 view shows fewer than 30 points (03.png: 5)" in finding_text(inspection, "warning")
 
 
-def test_imprecise_poses(scene):
+def test_large_reprojection_error_is_a_warning(scene):
     rows = [struct.pack("<Q3d3BdQ", i, 0.1, 0.1, i / 200, 9, 9, 9, 2 + i / 100, 0) for i in range(200)]
     (scene / "sparse" / "0" / "points3D.bin").write_bytes(struct.pack("<Q", len(rows)) + b"".join(rows))
     assert "the mean reprojection error of the points is 3.00 px" in finding_text(
@@ -418,7 +418,7 @@ def test_photographs_that_show_nothing_stop_inspection_and_run(scene, kind, capl
     assert inspection.verdict.startswith(f"cannot train: {words}")
 
 
-def test_masks(scene):
+def test_masks_of_wrong_size_or_content_are_errors(scene):
     (scene / "masks").mkdir()
     photograph(scene / "masks" / "00.png")
     assert (Inspection.from_folder(scene).facts.photos.mask_count, Inspection.from_folder(scene).findings) == (1, [])
@@ -430,7 +430,7 @@ def test_masks(scene):
     assert "1 image file cannot be decoded (mask of 01.png)" in finding_text(Inspection.from_folder(scene), "error")
 
 
-def test_few_views(tmp_path):
+def test_few_training_views_are_reported(tmp_path):
     model = orbit()
     inspection = Inspection.from_folder(write(tmp_path, replace(model, images=model.images[:5])))
     assert inspection.verdict == "trains, but there are only 4 training views"
@@ -439,7 +439,7 @@ def test_few_views(tmp_path):
 # ---- what is shown
 
 
-def test_command_line(scene, tmp_path):
+def test_inspect_writes_a_self_contained_page(scene, tmp_path):
     done = clsplat("inspect", scene, "--html", tmp_path / "page.html")
     assert done.stdout.splitlines()[-1].strip() == "ready to train"
     assert "reprojection" not in done.stdout  # the writer's errors are all the same: a placeholder

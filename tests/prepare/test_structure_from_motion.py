@@ -119,12 +119,12 @@ def read_model(folder: Path):
 
 
 @pytest.mark.parametrize("matching", ["sequential", "vocabulary"])
-def test_other_matching_modes(photos, tmp_path, matching):
+def test_other_matching_modes_place_most_photographs(photos, tmp_path, matching):
     mapped = map_photographs(photos, tmp_path, matching=matching, neighbors=3)
     assert len(read_scene(mapped).views) >= 12
 
 
-def test_photographs_without_features(tmp_path):
+def test_photographs_without_features_are_refused(tmp_path):
     pytest.importorskip("pycolmap")
     for i in range(3):
         cv2.imwrite(str(tmp_path / f"{i}.png"), np.full((64, 64), np.linspace(60, 90, 64)).astype(np.uint8))
@@ -430,7 +430,7 @@ BENT = [
 
 
 @pytest.mark.parametrize(("lens", "undefined"), list(zip(BENT, cycle(("crop", "mask")), strict=False)))
-def test_undistorted_scene(tmp_path, lens, undefined):
+def test_undistorted_pixels_follow_pinhole_rays(tmp_path, lens, undefined):
     """A pattern that depends on the ray is seen along the pinhole's own rays; what is undefined is masked."""
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     (tmp_path / "images").mkdir()

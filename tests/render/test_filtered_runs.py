@@ -103,7 +103,7 @@ def test_training_uses_every_level(finished):
     assert {sampler.at(step).view.downscale for step in range(1, 51)} == {1, 2, 4}
 
 
-def test_zooming_in(tiny_scene, tmp_path):
+def test_models_are_evaluated_above_the_training_size(tiny_scene, tmp_path):
     """Trained at 1/4, tested up to the full size; factors are those of the photographs."""
     run = train(tiny_scene, tmp_path, "scene.downscale=4", "evaluate.downscales=[4, 2, 1]", "optimize.steps=5")
     assert run.scene.views[0].camera.width == 10

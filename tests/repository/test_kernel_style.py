@@ -30,7 +30,7 @@ def kernels(path: Path) -> list[tuple[str, str, str]]:
     return results
 
 
-def test_lines():
+def test_kernel_lines_are_short_and_clean():
     faults = []
     for path in FILES:
         lines = path.read_text().splitlines()
@@ -51,7 +51,7 @@ def test_header_describes_the_computation():
     assert not faults, f"say what the files compute: {faults}"
 
 
-def test_words():
+def test_kernels_contain_no_forbidden_words():
     actual = {path.name: re.findall(FORBIDDEN, path.read_text()) for path in FILES}
     assert not any(actual.values()), "\n".join(f"{name}: {words}" for name, words in actual.items() if words)
 

@@ -107,7 +107,7 @@ def test_final_answer_is_complete_and_the_last():
     assert actual.count(b"HTTP/1.1 200") == 1
 
 
-def test_used_port_is_one_sentence_or_the_next_one_is_taken(server):
+def test_port_in_use_is_refused_or_the_next_one_is_used(server):
     with pytest.raises(ConfigError, match=rf"--live: port {server.port} of 127.0.0.1 cannot be used \(.*\); give ano"):
         Server(server.port, "token", server.handle)
     other = Server(0, "token", server.handle)

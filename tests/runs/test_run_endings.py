@@ -127,7 +127,7 @@ def test_run_continues_when_its_output_is_not_read(tiny_scene, tmp_path):
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("arguments", [["devices"], ["--help"]], ids=" ".join)
-def test_unwritable_output_is_one_line(arguments):
+def test_unwritable_output_is_reported_in_one_line(arguments):
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "clsplat", *arguments]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)

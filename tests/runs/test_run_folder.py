@@ -115,7 +115,7 @@ UNWRITABLE = {  # --out -> the exit code, and what the sentence says
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="names and faults of POSIX")
 @pytest.mark.parametrize("out", UNWRITABLE)
-def test_impossible_run_folder_is_one_sentence(out, tiny_scene, tmp_path, monkeypatch, capsys):
+def test_impossible_run_folder_is_refused_in_one_sentence(out, tiny_scene, tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("")
     place = out.replace("FILE", "file").replace("SCENE", str(tiny_scene)).replace("ROOT", "/")
     monkeypatch.chdir(tmp_path)

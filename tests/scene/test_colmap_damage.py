@@ -62,7 +62,7 @@ def test_huge_count_allocates_nothing(tmp_path: Path, stem: str, offset: int, co
     assert f"{stem}.bin: byte {offset + 8}" in message
 
 
-def test_unterminated_name(tmp_path: Path) -> None:
+def test_unterminated_image_name_is_refused(tmp_path: Path) -> None:
     file = write_scene(tmp_path, ColmapModel([PINHOLE], [ImageEntry("abcdefgh")])) / "sparse" / "0" / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"\0" * 9, b"\1" * 9))  # the end of the name and the count after it
     assert "image name" in refusal(read_scene, tmp_path)
@@ -108,7 +108,7 @@ def test_name_outside_the_image_folder(tmp_path: Path, name: str) -> None:
         ((1, 0, 0, 0), (0, 1e300, 0)),  # the extent of the scene would be infinite
     ],
 )
-def test_invalid_pose(tmp_path: Path, quaternion: tuple[float, ...], translation: tuple[float, ...]) -> None:
+def test_invalid_pose_is_refused(tmp_path: Path, quaternion: tuple[float, ...], translation: tuple[float, ...]) -> None:
     images = [*tiny_model().images, ImageEntry("bad.jpg", 1, quaternion, translation)]
     assert "the pose of 'bad.jpg'" in refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), images=images)))
 
@@ -121,7 +121,7 @@ def test_camera_wider_than_any_image(tmp_path: Path, kind: str, width: int) -> N
     assert "at most 32768" in message
 
 
-def test_tiny_focal_length(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+def test_tiny_focal_length_is_refused(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     camera = replace(PINHOLE, model="OPENCV_FISHEYE", params=(5e-324, 50.0, 32.0, 24.0, 0.1, 0.0, 0.0, 0.0))
     assert "focal lengths of at least 0.001" in refusal(
         read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]))
@@ -129,7 +129,7 @@ def test_tiny_focal_length(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> 
     assert not recwarn.list
 
 
-def test_unknown_camera(tmp_path: Path) -> None:
+def test_unknown_camera_is_refused(tmp_path: Path) -> None:
     images = [*tiny_model().images, ImageEntry("d.jpg", camera=7)]
     message = refusal(read_scene, write_scene(tmp_path, replace(tiny_model(), images=images)))
     assert "'d.jpg' has camera 7" in message
@@ -158,14 +158,14 @@ def test_distorted_camera_without_images_is_ignored(tmp_path: Path) -> None:
         replace(PINHOLE, params=(50.0, 51.0, math.nan, 25.25)),
     ],
 )
-def test_invalid_camera(tmp_path: Path, camera: CameraEntry) -> None:
+def test_invalid_camera_is_refused(tmp_path: Path, camera: CameraEntry) -> None:
     assert "expected a positive size" in refusal(
         read_scene, write_scene(tmp_path, replace(tiny_model(), cameras=[camera]))
     )
 
 
 @pytest.mark.parametrize("number", [-1, 18, 2**31 - 1])
-def test_unknown_camera_model(tmp_path: Path, number: int) -> None:
+def test_unknown_camera_model_is_refused(tmp_path: Path, number: int) -> None:
     file = write_scene(tmp_path, tiny_model()) / "sparse" / "0" / "cameras.bin"
     data = bytearray(file.read_bytes())
     struct.pack_into("<i", data, 12, number)

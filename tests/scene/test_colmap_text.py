@@ -39,7 +39,7 @@ def write_text(path: Path, **changes: str) -> Path:
     ],
     ids=["plain", "crlf", "bom", "comments", "blank", "omitted"],
 )
-def test_text_dialects(tmp_path: Path, edit) -> None:
+def test_text_dialects_give_the_same_scene(tmp_path: Path, edit) -> None:
     files = {name.removesuffix(".txt"): edit(text) for name, text in TEXT.items()}
     scene = read_scene(write_text(tmp_path, **files))
     assert [view.name for view in scene.views] == ["a.jpg", "b c.jpg"]

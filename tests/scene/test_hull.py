@@ -134,7 +134,7 @@ def test_cameras_inside_the_box_or_facing_away():
     assert np.abs(np.linalg.norm(points.positions, axis=1) - RADIUS).max() < 0.06
 
 
-def test_image_with_alpha(tmp_path: Path):
+def test_rgba_is_read_at_the_size_of_the_view(tmp_path: Path):
     """At half the size; not of one that has none, or whose alpha is a mask."""
     rng = np.random.default_rng(0)
     pixels = rng.integers(0, 256, (8, 12, 4), np.uint8)

@@ -20,19 +20,19 @@ def encoded(suffix: str, *options: int) -> bytes:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".webp"])
-def test_every_format(tmp_path, suffix):
+def test_size_is_read_from_the_header_of_each_format(tmp_path, suffix):
     file = tmp_path / f"image{suffix}"
     file.write_bytes(encoded(suffix))
     assert read_header(file) == Header(37, 23)
 
 
-def test_progressive_jpeg(tmp_path):
+def test_size_of_a_progressive_jpeg_is_read(tmp_path):
     (tmp_path / "a.jpg").write_bytes(encoded(".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1))
     assert read_header(tmp_path / "a.jpg") == Header(37, 23)
 
 
 @pytest.mark.parametrize("name", ["fox", "kitchen", "lund", "sceaux_photos", "lego_200/test"])
-def test_real_photographs(name):
+def test_headers_of_real_photographs_have_the_decoded_size(name):
     files = [f for f in sorted(data_set(name).rglob("*")) if f.suffix.lower() in (".jpg", ".png")]
     assert files
     for file in files[:10]:
@@ -44,7 +44,7 @@ def test_real_photographs(name):
 @pytest.mark.parametrize(
     ("order", "orientation", "expected"), [("<", 6, 6), (">", 6, 6), ("<", 8, 8), (">", 0, 1), ("<", 9, 1)]
 )
-def test_orientation(tmp_path, order, orientation, expected):
+def test_orientation_is_read_from_exif(tmp_path, order, orientation, expected):
     (tmp_path / "a.jpg").write_bytes(with_exif(encoded(".jpg"), order, orientation))
     assert read_header(tmp_path / "a.jpg") == Header(37, 23, expected)
 

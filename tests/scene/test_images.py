@@ -82,7 +82,7 @@ def test_alpha_is_composited_in_double_and_truncated(tmp_path: Path, background)
     assert (image[255] == pixels[255, :, :3]).all()  # where it is opaque, nothing is lost
 
 
-def test_sixteen_bit_alpha(tmp_path: Path) -> None:
+def test_sixteen_bit_alpha_is_blended(tmp_path: Path) -> None:
     pixels = np.full((2, 2, 4), 65535, np.uint16)
     pixels[:, :, 3] = 32768
     image = load_image(make_view(stored(tmp_path / "a.png", pixels), 2, 2))
@@ -183,7 +183,7 @@ def test_wrong_size_names_both_sizes(tmp_path: Path, size: tuple[int, int]) -> N
     assert f"{size[0]}x{size[1]}" in message
 
 
-def test_real_photographs(tmp_path: Path) -> None:
+def test_real_photograph_is_loaded_as_opencv_does(tmp_path: Path) -> None:
     path = data_set("lund") / "images" / "01.jpg"
     photo = cv2.imread(str(path))[:, :, ::-1]
     np.testing.assert_array_equal(load_image(make_view(path, 480, 360)), photo)

@@ -73,7 +73,7 @@ MATCHES = {  # the kind of dataset, the names in it, and the files on disk in th
 
 
 @pytest.mark.parametrize("case", MATCHES)
-def test_photograph_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture, case: str) -> None:
+def test_moved_photographs_are_matched_by_path(tmp_path: Path, caplog: pytest.LogCaptureFixture, case: str) -> None:
     kind, names, files = MATCHES[case]
     scene = made(tmp_path / "scene", kind, names, files)
     with caplog.at_level(logging.INFO, "clsplat"):
@@ -104,7 +104,7 @@ REFUSALS = {  # the kind of dataset, its names, the files on disk, and what is s
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_photograph_is_refused(tmp_path: Path, case: str) -> None:
+def test_ambiguous_or_missing_photographs_are_refused(tmp_path: Path, case: str) -> None:
     kind, names, files, text = REFUSALS[case]
     scene = made(tmp_path / "scene", kind, names, files)
     assert text in refusal(read_scene, scene)
@@ -165,7 +165,7 @@ def test_photographs_of_two_files_are_searched_together(tmp_path: Path) -> None:
     assert "1 of 2 image files are missing" in refusal(read_scene, tmp_path)
 
 
-def test_masks_are_found(tmp_path: Path) -> None:
+def test_masks_are_matched_by_name(tmp_path: Path) -> None:
     scene = made(tmp_path, "colmap", ["c\\a.jpg", "c\\b.jpg"], ["images/c/a.jpg", "images/c/b.jpg", "masks/c/A.PNG"])
     assert [view.mask_path for view in read_scene(scene).views] == [scene / "masks" / "c" / "A.PNG", None]
     scene = made(tmp_path / "json", JSON, ["images/a.jpg"], ["images/a.jpg"])
@@ -184,7 +184,9 @@ def test_masks_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "place", ["colmap/sparse/0", "dense/0/sparse", "colmap_sparse/0", "colmap_text", "a/b/sparse/0", "output/model"]
 )
-def test_model_is_found(tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str) -> None:
+def test_colmap_model_is_detected_in_known_folders(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, place: str
+) -> None:
     for image in orbit().images:
         (tmp_path / "images").mkdir(exist_ok=True)
         photograph(tmp_path / "images" / image.name)
@@ -227,7 +229,7 @@ def test_nested_transforms_file_is_read(tmp_path: Path) -> None:
     assert located(tmp_path) == {"images/a.jpg": "images/a.jpg", "images/b.jpg": "images/b.jpg"}
 
 
-def test_missing_photographs_without_sizes_are_one_error(tmp_path: Path) -> None:
+def test_missing_photographs_without_sizes_give_one_error(tmp_path: Path) -> None:
     scene = made(tmp_path, JSON, [f"images/{i}.png" for i in range(100)], [])
     table = json.loads((scene / "transforms.json").read_text())
     (scene / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": table["frames"]}))
@@ -256,7 +258,7 @@ def test_parent_folder_with_cameras_is_named(tmp_path: Path) -> None:
     assert f"the cameras are in {scene}: give that folder" in refusal(read_scene, scene / "images")
 
 
-def test_depth_maps_are_found(tmp_path: Path) -> None:
+def test_depth_maps_are_matched_by_name(tmp_path: Path) -> None:
     photograph(made(tmp_path, JSON, [], []) / "A.PNG")
     (tmp_path / "x").mkdir()
     photograph(tmp_path / "x" / "b.tif")

@@ -50,7 +50,7 @@ def test_only_fully_unmasked_pixels_count(tmp_path):
     np.testing.assert_array_equal(load_mask(view), expected)
 
 
-def test_alpha_as_mask(tmp_path):
+def test_alpha_is_a_mask_only_if_requested(tmp_path):
     pixels = np.full((3, 4, 4), 200, np.uint8)
     pixels[:, :, 3] = [0, 128, 254, 255]
     view = make_view(store(tmp_path / "a.png", pixels), 4, 3)

@@ -36,7 +36,7 @@ def test_levels_are_box_means_without_alpha(rng):
         np.testing.assert_array_equal(level, np.floor(means))
 
 
-def test_metadata(folders):
+def test_metadata_follows_the_layout_of_mip_nerf(folders):
     source, out = folders
     metadata = json.loads((out / "metadata.json").read_text())
     assert set(metadata) == {"train", "test"}
@@ -139,7 +139,7 @@ def scale_fractions(views: list[View], order: str, steps: int) -> dict[float, fl
     return {scale: count / steps for scale, count in result.items()}
 
 
-def test_order_decides_how_often_scales_are_drawn():
+def test_order_decides_how_often_scales_are_sampled():
     views = views_of(10, 1, 2, 4, 8)
     assert scale_fractions(views, "uniform", 400) == {1: 0.25, 2: 0.25, 4: 0.25, 8: 0.25}
     assert scale_fractions(views, "shuffle", 500) == {1: 0.4, 2: 0.2, 4: 0.2, 8: 0.2}
@@ -157,7 +157,7 @@ def test_order_depends_only_on_seed_and_step(order):
     assert draw_views(views, order, 60, seed=4) != straight
 
 
-def test_every_view_is_drawn_before_any_repeats():
+def test_every_view_is_sampled_before_any_repeats():
     views = views_of(7, 1, 2)
     result = draw_views(views, "uniform", 28)
     for epoch in (result[:14], result[14:]):

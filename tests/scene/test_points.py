@@ -39,7 +39,7 @@ PLAIN = [*[("f", name) for name in "xyz"], *[("B", name) for name in ("red", "gr
     ("dialect", "form"),
     [*(("plain", "ascii"), ("double", LITTLE), ("extra", "ascii"), ("extra", LITTLE), ("order", LITTLE))],
 )
-def test_ply_dialects(tmp_path: Path, form: str, dialect: str) -> None:
+def test_ply_dialects_give_the_same_points(tmp_path: Path, form: str, dialect: str) -> None:
     properties, rows = list(PLAIN), ROWS
     if dialect == "double":
         properties[:3] = [("d", name) for name in "xyz"]
@@ -100,13 +100,13 @@ def test_colors_are_rounded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_ply_without_points(tmp_path: Path, form: str, recwarn: pytest.WarningsRecorder) -> None:
+def test_ply_without_points_is_read_silently(tmp_path: Path, form: str, recwarn: pytest.WarningsRecorder) -> None:
     (tmp_path / "p.ply").write_bytes(ply(form, PLAIN, []))
     assert len(read_points_ply(tmp_path / "p.ply")) == 0
     assert not recwarn
 
 
-def test_real_ply() -> None:
+def test_points_of_a_real_ply_are_plausible() -> None:
     points = read_points_ply(data_set("fox_peers") / "points_10k.ply")
     assert len(points) == 10_000
     assert np.ptp(points.positions, axis=0).min() > 1
@@ -136,7 +136,7 @@ DAMAGE = [
 @pytest.mark.parametrize(
     ("old", "new", "form"), [(*one, form) for one, form in zip(DAMAGE, cycle(("ascii", LITTLE)), strict=False)]
 )
-def test_damaged_ply(tmp_path: Path, form: str, old: bytes, new: bytes) -> None:
+def test_damaged_ply_is_refused(tmp_path: Path, form: str, old: bytes, new: bytes) -> None:
     data = ply(form, PLAIN, ROWS)
     path = tmp_path / "p.ply"
     old, new = (text.replace(b"binary_little_endian", form.encode()) for text in (old, new))
@@ -146,7 +146,7 @@ def test_damaged_ply(tmp_path: Path, form: str, old: bytes, new: bytes) -> None:
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
-def test_ply_cut_anywhere(tmp_path: Path, form: str) -> None:
+def test_truncated_ply_is_refused(tmp_path: Path, form: str) -> None:
     data = ply(form, PLAIN, ROWS)
     path = tmp_path / "p.ply"
     # In text, a cut inside the last number cannot be detected.
@@ -174,7 +174,7 @@ CLOUD = PointCloud(np.float32([[1, 2, 3]]), np.float32([[1, 0, 0.2]]))
         ("transforms.json", "a/p.ply", {"ply_file_path": "./a/p.ply"}),
     ],
 )
-def test_points(tmp_path: Path, name: str, file: str, keys: dict) -> None:
+def test_points_are_read_with_a_transforms_file(tmp_path: Path, name: str, file: str, keys: dict) -> None:
     write(tmp_path, name, **LENS, **keys, frames=frames("a.png", "b.png"))
     write_points_ply(tmp_path / file, CLOUD)
     points = read_scene(tmp_path).points

@@ -65,7 +65,7 @@ def test_rotation_between_directions(end):
     assert np.linalg.det(rotation) == pytest.approx(1)
 
 
-def test_utm_of_known_places():
+def test_utm_coordinates_of_known_places_are_right():
     """The CN Tower, as published; a quarter of the meridian by numerical integration; a southern place."""
     tower, epsg = to_utm(np.array([[43.642567, -79.387139, 100.0]]))
     np.testing.assert_allclose(tower, [[630084, 4833438, 100]], atol=1)

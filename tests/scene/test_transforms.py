@@ -19,7 +19,7 @@ from tests.support.transforms_scene import LENS, POSE, frames, write
 # ---- real data
 
 
-def test_lego() -> None:
+def test_cameras_of_lego_look_at_the_origin() -> None:
     path = data_set("lego_200")
     scene = read_scene(path)
     assert (len(scene.train), len(scene.test)) == (100, 25)
@@ -106,7 +106,7 @@ def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_intrinsics(tmp_path: Path, values: dict, expected: Camera) -> None:
+def test_intrinsics_of_a_frame_override_shared_ones(tmp_path: Path, values: dict, expected: Camera) -> None:
     """Per-frame values take precedence over shared ones."""
     per_frame = len(values) % 2 == 0
     wrong = dict.fromkeys(values, "overridden")
@@ -177,7 +177,7 @@ def test_damaged_frame_is_named(tmp_path: Path, change: dict, message: str) -> N
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"frames": 3}', '{"frames": [1]}', "\xff"])
-def test_file_without_transforms(tmp_path: Path, text: str) -> None:
+def test_file_without_transforms_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
     assert "transforms.json: " in refusal(read_scene, tmp_path)
 
@@ -207,7 +207,7 @@ def test_thousand_damaged_frames_are_a_thousand_faults(tmp_path: Path) -> None:
     assert len(parts.faults) == len(set(parts.faults)) == 1000
 
 
-def test_no_frames(tmp_path: Path) -> None:
+def test_file_without_frames_is_refused(tmp_path: Path) -> None:
     assert "no images" in refusal(read_scene, write(tmp_path, **LENS, frames=[]))
 
 
@@ -217,7 +217,7 @@ def test_missing_images_are_counted(tmp_path: Path) -> None:
     assert "1 of 2 image files are missing" in refusal(read_scene, tmp_path)
 
 
-def test_mask_and_backslashes(tmp_path: Path) -> None:
+def test_backslashes_and_masks_in_paths_are_accepted(tmp_path: Path) -> None:
     write(tmp_path, **LENS, frames=frames("a.png", "images/b.png"))
     table = LENS | {"frames": frames(".\\images\\b.png", mask_path="./a.png")}
     (tmp_path / "transforms.json").write_text(json.dumps(table | {"test_filenames": []}))
@@ -264,14 +264,14 @@ def test_nerfstudio_holds_out_every_nth_by_name(tmp_path: Path) -> None:
         ({"train_filenames": ["a.png"], "test_filenames": [], "val_filenames": ["b.png"]}, ["a.png"], []),
     ],
 )
-def test_nerfstudio_lists(tmp_path: Path, lists: dict, train: list[str], test: list[str]) -> None:
+def test_nerfstudio_lists_define_the_split(tmp_path: Path, lists: dict, train: list[str], test: list[str]) -> None:
     scene = read_scene(write(tmp_path, **LENS, **lists, frames=frames("a.png", "b.png", "c.png", "d.png")))
     assert [view.name for view in scene.split("train")] == train
     assert [view.name for view in scene.split("test")] == test
 
 
 @pytest.mark.parametrize("entries", ["a.png", [1], ["z.png"]])
-def test_invalid_nerfstudio_list(tmp_path: Path, entries) -> None:
+def test_invalid_nerfstudio_list_is_refused(tmp_path: Path, entries) -> None:
     assert "test_filenames" in refusal(
         read_scene, write(tmp_path, **LENS, test_filenames=entries, frames=frames("a.png", "b.png"))
     )

@@ -398,7 +398,7 @@ def broken(make_run, how: str) -> Path:
     ("settings of something else", 2, "expected keys such as name and stages"),
     ("no such scene setting", 2, "did you mean 'path'"),
 ])  # fmt: skip
-def test_refusals(make_run, tmp_path, how, code, words):
+def test_runs_that_cannot_be_compared_are_refused(make_run, tmp_path, how, code, words):
     with pytest.raises(ClsplatError, match=words) as error:
         write_comparison([broken(make_run, how)], tmp_path / "page.html")
     assert error.value.exit_code == code
@@ -431,7 +431,7 @@ def test_damaged_render_is_refused(make_run, tmp_path):
         write_comparison([folder], tmp_path / "page.html")
 
 
-def test_command(make_run, tmp_path):
+def test_command_compares_runs_and_refuses_missing_ones(make_run, tmp_path):
     done = clsplat("compare", make_run("a"), make_run("b", "seed=1"), "--out", tmp_path / "c.html")
     assert "2 runs compared" in done.stdout
     assert "tiny" in (tmp_path / "c.html").read_text()

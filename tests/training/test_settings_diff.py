@@ -111,7 +111,7 @@ def test_stages_that_only_read_the_model_may_change_entirely():
     assert Evaluate.output_keys > base.CADENCE == frozenset(CADENCE)
 
 
-def test_first_difference():
+def test_first_difference_is_named_by_its_key():
     old = {"a": 1, "b": {"c": [1, {"d": 2}]}}
     assert first_difference(old, old) is None
     assert str(first_difference(old, {"a": 1, "b": {"c": [1, {"d": 3}]}})) == "b.c[1].d was 2, is 3"

@@ -154,7 +154,7 @@ def test_filmstrip_images_jump_to_their_cameras(opened):
     opened.call("Emulation.setEmulatedMedia", features=[])
 
 
-def test_navigation(opened):
+def test_mouse_and_keys_move_the_camera(opened):
     before = opened.run(POSE)
     radius = np.linalg.norm(np.subtract(before[:3], opened.run("viewer.pivot")))
     for act in (
@@ -206,7 +206,7 @@ def test_url_contains_the_camera(browser, page, opened):
         assert browser.run("viewer.at") == 0, "the first view, as without an address"
 
 
-def test_display_modes(opened):
+def test_display_modes_differ(opened):
     pictures = [screenshot(opened)]
     for key in "234":
         opened.key(key)
@@ -356,7 +356,7 @@ def test_empty_and_damaged_models(browser, tmp_path):
     assert "cannot be shown" in browser.run("document.getElementById('message').textContent")
 
 
-def test_touch_gestures(page, tmp_path):
+def test_touch_gestures_orbit_zoom_and_pan(page, tmp_path):
     with Browser(tmp_path, 390, 700, scale=1, touch=True) as phone:
         phone.open(page)
         first, pose = phone.run(AWAY), phone.run(POSE)

@@ -187,7 +187,7 @@ def test_no_device_is_opened(run, tmp_path, monkeypatch):
     clsplat.view(run, out=tmp_path / "a.html")
 
 
-def test_names_of_models(tmp_path):
+def test_models_of_one_name_are_named_by_folder(tmp_path):
     for name in ("a/run", "b/run", "other"):
         (tmp_path / name).mkdir(parents=True)
     assert model_names([tmp_path / "a" / "run", tmp_path / "other"]) == ["run", "other"]

@@ -100,7 +100,7 @@ def test_invisible_splats_are_omitted():
     np.testing.assert_allclose(np.sort(unpacked(packed).means[:, 0]), np.sort(model.means[5:, 0]), atol=1e-3)
 
 
-def test_empty_model():
+def test_empty_model_can_be_packed():
     packed = pack(cloud(4)[:0])
     assert (packed.count, packed.header["levels"]) == (0, [0] * LEVELS)
     assert len(unpacked(packed).means) == 0
@@ -114,7 +114,7 @@ def test_coincident_splats_of_equal_size():
     np.testing.assert_allclose(np.log(pixels.scales), same["log_scales"], rtol=1e-5)
 
 
-def test_extreme_colors():
+def test_extreme_colors_survive_packing():
     model = spread(300)
     wild = replace(model, sh_rest=model.sh_rest * 60, sh_base=model.sh_base * 20)
     pixels = unpacked(pack(wild))

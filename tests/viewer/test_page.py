@@ -178,7 +178,7 @@ def test_initial_camera_of_a_page(tmp_path):
     assert np.isfinite(Viewpoint.from_points(model.means, (), None).start.world_to_camera).all()
 
 
-def test_slim_model_alone_is_framed_whole():
+def test_slim_model_without_a_scene_fits_into_the_image():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.normal(0, 0.05, 2000), rng.uniform(-1, 1, 2000), rng.normal(0, 0.05, 2000)])
     start = Viewpoint.from_points(points, (), None).start

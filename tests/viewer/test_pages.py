@@ -150,7 +150,7 @@ def test_name_that_is_not_unicode_shows_a_question_mark():
 @pytest.mark.parametrize(("seconds", "words"), [
     (0.4, "0 s"), (59.4, "59 s"), (60, "1 min 0 s"), (3599, "59 min 59 s"), (3600, "1 h 0 min"), (7322, "2 h 2 min"),
 ])  # fmt: skip
-def test_durations(seconds, words):
+def test_durations_are_written_in_words(seconds, words):
     assert duration_text(seconds) == words
 
 

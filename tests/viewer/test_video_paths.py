@@ -188,7 +188,7 @@ def test_outlier_camera_changes_nothing(rng):
     np.testing.assert_array_equal(positions(with_it), positions(without))
 
 
-def test_sizes():
+def test_video_sizes_are_even_and_bounded():
     assert even_size(Camera(225, 401, 9.0, 9.0, 1.0, 1.0)) == (224, 400)
     assert max(even_size(Camera(20001, 10000, 9.0, 9.0, 1.0, 1.0))) <= 8192
     wide = same_area(CAMERA, (400, 300))

@@ -255,7 +255,7 @@ def test_invalid_video_is_refused_before_any_work(options, message, few_steps, t
     assert not list(tmp_path.iterdir())
 
 
-def test_model_alone_is_rendered_from_outside(few_steps, tmp_path):
+def test_model_without_a_scene_is_rendered_from_outside(few_steps, tmp_path):
     """A still, a turntable whose first frame is the still, and a camera at a given position."""
     model = shutil.copy(few_steps / "point_cloud.ply", tmp_path / "scan.ply")
     assert clsplat.render_views(model, out=tmp_path / "still") == 1

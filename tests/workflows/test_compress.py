@@ -57,7 +57,7 @@ def searched(few_steps: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("0dB", None, 0),
     ],
 )
-def test_targets(text, most, change):
+def test_targets_are_parsed(text, most, change):
     result = CompressionTarget.parse(text)
     assert (result.max_bytes, result.psnr_change) == (most, change)
 
