@@ -204,5 +204,5 @@ def _require_memory(blocks: int, point_bytes: int, voxel: float) -> None:
     if free is not None and size > free:
         raise MemoryLimitError(
             f"--voxel {voxel:.3g}: needs {size / 2**30:.1f} GiB of memory, but only {free / 2**30:.1f} GiB is free; "
-            f"use a larger voxel, such as {2 * voxel:.2g}"
+            f"use a larger voxel, such as {2 * voxel:.2g}, or a larger --scale"
         )
