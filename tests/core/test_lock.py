@@ -339,7 +339,7 @@ def test_run_that_wakes_up_notices_the_takeover(tmp_path, monkeypatch):
 
 
 def test_heartbeat_stops_when_the_run_folder_is_closed(tmp_path, monkeypatch):
-    monkeypatch.setattr(writing, "BEAT", 0.002)
+    monkeypatch.setattr(writing, "HEARTBEAT_INTERVAL_S", 0.002)
     with run_folder.open_run_folder(RunState.read(tmp_path / "run"), "new") as status:
         pass
     (tmp_path / "run" / "status.json").write_text("of the next")

@@ -103,7 +103,7 @@ def test_emergency_save_skips_a_lost_folder(tiny_scene, tmp_path, monkeypatch):
 
 
 def test_heartbeat_stops_and_reports_a_lost_folder(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(writing, "BEAT", 0.002)
+    monkeypatch.setattr(writing, "HEARTBEAT_INTERVAL_S", 0.002)
     with run_folder.open_run_folder(RunState.read(tmp_path / "run"), "new") as status:
         before = take_folder(tmp_path / "run")
         while status.lock_error is None:
