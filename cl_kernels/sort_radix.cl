@@ -7,6 +7,10 @@
  * Local memory: 4 << DIGIT_BITS bytes * TEAM.  Deterministic. */
 #include "common.h"
 
+#define OUTPUT_KEYS 0
+#define OUTPUT_CARRIED 1
+#define OUTPUT_NONE 2
+
 static inline void count_digits(__global const uint *keys, __local uint *counts, const uint first,
                                 const uint run, const uint shift, const uint digits, const uint count)
 {
@@ -47,16 +51,20 @@ void radix_count(
     }
 }
 
-/* Move every pair to its position.  In the first pass the values are the indices of the keys: 0, 1, 2, ... */
+/* Move every pair to its position.  In the first pass the values are the indices of the keys: 0, 1, 2, ...  The last pass
+ * may write something else instead of the keys. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void radix_scatter(
     __global const uint *restrict keys,          // [capacity]
     __global const uint *restrict values,        // [capacity], not read in the first pass
     __global const uint *restrict key_count,     // [1]
     __global const uint *restrict digit_offset,  // [digits*blocks+1] scanned digit_count
+    __global const uint *restrict carried,       // [capacity] by value; read only if they are written
     __global uint *restrict sorted_keys,         // [capacity]
     __global uint *restrict sorted_values,       // [capacity]
+    __global uint *restrict digit_first,         // [digits+1] first pair of each digit
     const uint first_pass,
+    const uint output,                           // instead of the keys
     const uint shift,
     const uint digits,
     const uint capacity)
@@ -76,11 +84,14 @@ void radix_scatter(
             position += digits_here;
         }
     }
+    for (uint digit = item; block == 0 && digit <= digits; digit += TEAM)
+        digit_first[digit] = digit_offset[digit * blocks];
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint i = first; i < first + run && i < count; i++) {
-        const uint key = keys[i];
+        const uint key = keys[i], value = first_pass ? i : values[i];
         const uint position = positions[((key >> shift) & (digits - 1)) * TEAM + item]++;
-        sorted_keys[position] = key;
-        sorted_values[position] = first_pass ? i : values[i];
+        if (output != OUTPUT_NONE)
+            sorted_keys[position] = output == OUTPUT_CARRIED ? carried[value] : key;
+        sorted_values[position] = value;
     }
 }

@@ -18,6 +18,7 @@ from clsplat.render.workspace import GROWTH_FACTOR, Workspace
 Sort = Literal["auto", "radix", "bitonic"]
 Defines = dict[str, int] | None  # macros of the projection
 COUNTING: dict[Sort, dict[str, int]] = {"radix": {}, "bitonic": {"COUNT_TILES": 1}}  # macros of the kernels that list
+OUTPUTS = {name: int(constants("sort_radix.cl")[f"OUTPUT_{name}"]) for name in ("KEYS", "CARRIED", "NONE")}
 SORT_CAPACITY = int(constants()["SORT_CAPACITY"])
 LONG_LIST = 32 * SORT_CAPACITY  # pairs; the bitonic sort compares each run of a list with all others
 MAX_SINGLE_GROUP_RUN = 32  # values per item up to which one group scans everything
@@ -139,9 +140,8 @@ class Tiler:
         self.device.program("large.cl", **(defines or {}), **COUNTING[sort]).count_large(tiles=band.tiles, **large)
         if sort == "bitonic":
             return self._index_order(count), self.scan(footprints.tile_count, count, "pair_offset")
-        order = self._depth_order(footprints.depth_key, count)
-        ordered_count = self.workspace.array("ordered_count", count, np.uint32)
-        self._scan.permute(items=count, values=footprints.tile_count, order=order, permuted=ordered_count, count=count)
+        carried = footprints.tile_count
+        ordered_count, order, _ = self.sort_pairs(footprints.depth_key, 32, count, "depth", carried=carried)
         return order, self.scan(ordered_count, count, "pair_offset")
 
     def _list_pairs(
@@ -248,16 +248,26 @@ class Tiler:
         return offset
 
     def sort_pairs(
-        self, keys: Array, bits: int, capacity: int, name: str, key_count: Array | None = None
-    ) -> tuple[Array, Array]:
+        self,
+        keys: Array,
+        bits: int,
+        capacity: int,
+        name: str,
+        key_count: Array | None = None,
+        carried: Array | None = None,
+        has_keys: bool = True,
+    ) -> tuple[Array, Array, Array]:
         """Sort keys below 2^bits stably; return the sorted keys and their original indices, both [capacity].
 
-        key_count: [1] number of keys, by default `capacity`.
+        The third result is the position of the first key of each digit of the last pass; after one pass, of each key.
+        key_count: [1] number of keys, by default `capacity`.  carried: [capacity] values that are returned in the order
+        of the keys, instead of the keys.  has_keys: whether the keys are returned.
         """
-        passes = -(-bits // self._digit_bits)
+        passes = self._passes(bits)
         width = -(-bits // passes)
-        _, blocks = self._runs(capacity, min_run=1 << 10)
+        blocks = max(1, self._runs(capacity, min_run=1 << 10)[1])
         values = keys  # the first pass does not read them
+        last_output = OUTPUTS["CARRIED" if carried else "KEYS" if has_keys else "NONE"]
         for number in range(passes):
             digits = 1 << min(width, bits - number * width)
             arguments: dict[str, Any] = {
@@ -271,6 +281,7 @@ class Tiler:
             self._radix.radix_count(digit_count=digit_count, **arguments)
             digit_offset = self.scan(digit_count, digits * blocks, "digit_offset")
             growth = 1.0 if key_count else GROWTH_FACTOR
+            digit_first = self.workspace.array(f"{name}_first", digits + 1, np.uint32)
             sorted_keys, sorted_values = (
                 self.workspace.array(f"{name}_{part}{number % 2}", capacity, np.uint32, growth)
                 for part in ("keys", "values")
@@ -278,22 +289,25 @@ class Tiler:
             self._radix.radix_scatter(
                 values=values,
                 digit_offset=digit_offset,
+                digit_first=digit_first,
+                carried=carried or keys,
+                output=last_output if number == passes - 1 else OUTPUTS["KEYS"],
                 sorted_keys=sorted_keys,
                 sorted_values=sorted_values,
                 first_pass=int(number == 0),
                 **arguments,
             )
             keys, values = sorted_keys, sorted_values
-        return keys, values
+        return keys, values, digit_first
+
+    def _passes(self, bits: int) -> int:
+        return -(-bits // self._digit_bits)
 
     def _runs(self, count: int, min_run: int) -> tuple[int, int]:
         """Return the number of values per item, and the number of groups."""
         balanced_run = -(-count // (4 * self.device.info.units))  # four runs per core balance the load
         run = 8 if self._team > 1 else max(min_run, balanced_run)
         return run, -(-count // (run * self._team))
-
-    def _depth_order(self, depth_key: Array, count: int) -> Array:
-        return self.sort_pairs(depth_key, 32, count, "depth")[1]
 
     def _index_order(self, count: int) -> Array:
         if self.workspace.length("index_order") < count:
@@ -304,7 +318,12 @@ class Tiler:
 
     def _sort_by_tile(self, pair_tile: Array, pair_count: Array, capacity: int, tiles: int) -> tuple[Array, Array]:
         bits = max(1, (tiles - 1).bit_length())
-        sorted_tile, tile_pairs = self.sort_pairs(pair_tile, bits, capacity, "tile", pair_count)
+        has_keys = self._passes(bits) > 1
+        sorted_tile, tile_pairs, first = self.sort_pairs(
+            pair_tile, bits, capacity, "tile", pair_count, has_keys=has_keys
+        )
+        if not has_keys:
+            return Array(self.device, first.buffer, (tiles + 1,), first.dtype), tile_pairs
         tile_offset = self.workspace.array("tile_offset", tiles + 1, np.uint32)
         self._pairs.find_tile_offsets(
             items=capacity + 1, sorted_tile=sorted_tile, pair_count=pair_count, tile_offset=tile_offset, tiles=tiles

@@ -138,7 +138,7 @@ class Records:
 
 KERNELS = {
     "project": "project_forward",
-    "pairs": "count_large permute emit_pairs emit_large find_tile_offsets",
+    "pairs": "count_large emit_pairs emit_large find_tile_offsets",
     "sort": "scan_blocks scan_offsets radix_count radix_scatter fill_tiles sort_tiles merge_runs",
     "blend": "blend_forward lay_over sky_forward",
     "loss": (

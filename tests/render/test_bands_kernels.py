@@ -209,11 +209,13 @@ def test_row_of_tiles_with_too_many_pairs_is_refused(device, rng, monkeypatch):
 @on_one_setting
 def test_uploads_keep_the_order_of_commands(device, rng):
     """Each launch reads the values that were uploaded before it, although all uploads share an array."""
-    workspace, order = Workspace(device), device.upload(np.arange(1000, dtype=np.uint32))
-    values = [rng.integers(0, 100, 1000).astype(np.uint32) for _ in range(20)]
-    results = [device.zeros(1000, np.uint32) for _ in values]
+    workspace, copy = Workspace(device), device.program("peak.cl").peak_copy
+    items = copy.group[0]
+    count = items * max(4, int(device.tuning["LANES"]))
+    values = [rng.integers(0, 100, count).astype(np.float32) for _ in range(20)]
+    results = [device.zeros(count) for _ in values]
     for expected, result in zip(values, results, strict=True):
         array = workspace.upload("values", expected)
-        device.program("scan.cl").permute(items=1000, values=array, order=order, permuted=result, count=1000)
+        copy(items=items, values=array, copied=result)
     for expected, result in zip(values, results, strict=True):
         np.testing.assert_array_equal(result.get(), expected)
