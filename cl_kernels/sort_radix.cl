@@ -51,8 +51,8 @@ void radix_count(
     }
 }
 
-/* Move every pair to its position.  In the first pass the values are the indices of the keys: 0, 1, 2, ...  The last pass
- * may write something else instead of the keys. */
+/* Move every pair to its position.  In the first pass the values are the indices of the keys: 0, 1, 2, ...  The last
+ * pass may write something else instead of the keys. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void radix_scatter(
     __global const uint *restrict keys,          // [capacity]

@@ -170,7 +170,7 @@ MORE = {  # that smaller pictures do not show
     ),
     "blend_forward simt, dim pixels": ("blend_simt.cl", "if (p.t > 0.0f)", "if (p.t > 0.01f)"),
     "pixel_loss, pixels that are equal": ("loss.cl", "difference < 0.0f ?", "difference <= 0.0f ?"),
-    "scan_offsets simt, a sum that wraps": ("scan.cl", "sum | (0u - carry)", "sum"),
+    "scan_offsets simt, a sum that wraps": ("scan.cl", "(uint)min(sum, (ulong)UINT_MAX)", "(uint)sum"),
     "pose_gradient, the shape": ("poses.cl", "by_position + 0.5f * by_rotation", "by_position + by_rotation"),
     "pose_gradient, the focal length": ("backward.h", "+ s->ray_x * ray_x + s->ray_y", "- s->ray_x * ray_x + s->ray_y"),
     "emit_large simt, one row an item": ("large.cl", "each = (rows + TEAM - 1) / TEAM", "each = 1"),
