@@ -23,7 +23,7 @@ class CovarianceTrace(Penalty):
     above: Annotated[float, Field(ge=0)] = 3.0e-4
     """τ, extents²; the default is a standard deviation of 1% of the extent along each axis."""
     pixels: Annotated[float, Field(gt=0)] | None = None
-    """s, in pixels of the nearest training view; replaces `above`."""
+    """Bound of the standard deviations, in pixels of the nearest training view; replaces `above`."""
 
     @property
     def tables(self) -> set[str]:

@@ -230,7 +230,7 @@ class VisibleError:
 
 
 def _append_products(vectors: Floats) -> NDArray[np.float32]:
-    """Append to vectors the products of their coefficients that the form multiplies, summed over channels."""
+    """Append to each vector the products of its pairs of coefficients, summed over the channels."""
     table = vectors.reshape(len(vectors), -1, 3)
     i, j = np.triu_indices(table.shape[1])
     return np.concatenate([vectors, (table[:, i] * table[:, j]).sum(axis=2)], axis=1).astype(np.float32)

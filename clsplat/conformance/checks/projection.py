@@ -275,7 +275,7 @@ def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
     for aspect in ASPECT_RATIOS:
         for name, settings in LONG_FILTERS.items():
             case = needle_case(rng, 12, aspect, **settings)
-            yield from check_long_splats(device, case, rng, f"needles of {aspect} to 1, filter {name}")
+            yield from check_long_splats(device, case, rng, f"splats {aspect} times as long as wide, filter {name}")
     yield from check_long_splats(device, wide_angle_case(rng), rng, "a view of 170 degrees")
 
 
