@@ -464,11 +464,11 @@ def convert(
     time: float | None = None,
     frames: int | None = None,
     world: bool = False,
+    collider: PathLike | None = None,
 ) -> dict[str, Any]:
     """Merge models into one file, whose suffix selects the format.  Return `format`, `gaussians`, and `bytes`.
 
-    The suffix .html writes a viewer page of the model, without a scene.
-    Gaussians with values that are not finite, or with a zero quaternion, are dropped.
+    The suffix .html writes a viewer page without a scene.  Gaussians with invalid values are dropped.
 
     crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`
     transform: such as "scale=2 rotate=90,0,0" (degrees)
@@ -481,6 +481,7 @@ def convert(
     frames: write this number of static files at evenly spaced times: PLY files in the folder `out`, or files named
         `out` with a number added
     world: write world coordinates, not coordinates relative to an origin
+    collider: a .ply or .obj mesh in the coordinates of the models, which OpenUSD stores for collisions
     """
     from clsplat.gaussians import conversion
     from clsplat.runs.model_file import refuse_field
@@ -501,6 +502,7 @@ def convert(
         world,
         sky,
         splats,
+        to_path(collider),
     )
     if frames is not None:
         return conversion.convert_frames(files, Path(out), frames, changes, quality)

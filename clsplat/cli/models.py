@@ -134,6 +134,9 @@ MergeOption = Annotated[
 SkyOption = Annotated[
     Literal["splats", "none"] | None, typer.Option(help="Write a learned sky as distant Gaussians, or remove it.")
 ]
+ColliderOption = Annotated[
+    Path | None, typer.Option(metavar="MESH", help="OpenUSD: a .ply or .obj mesh to collide with; invisible.")
+]
 FramesOption = Annotated[
     int | None,
     typer.Option(metavar="N", help="Dynamic model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
@@ -144,6 +147,7 @@ FramesOption = Annotated[
     "convert",
     "clsplat convert point_cloud.ply scene.spz",
     "clsplat convert moving.ply frames --frames 30",
+    "clsplat convert scene.ply scene.usdz --collider hull.ply",
     "clsplat convert a.ply b.sog both.glb --transform 'rotate=90,0,0'",
 )
 def convert(
@@ -173,8 +177,9 @@ def convert(
     ] = None,
     frames: FramesOption = None,
     world: Annotated[bool, typer.Option("--world", help="Write world coordinates, without an origin.")] = False,
+    collider: ColliderOption = None,
 ) -> None:
-    """Convert models to another format: PLY, SPZ, SOG, glTF, HTML, CSV, and others."""
+    """Convert models to another format: PLY, SPZ, SOG, glTF, OpenUSD, HTML, and others."""
     result = commands.convert(
         files[:-1],
         files[-1],
@@ -190,6 +195,7 @@ def convert(
         time=time,
         frames=frames,
         world=world,
+        collider=collider,
     )
     percent = 100 * result["bytes"] / max(result["bytes_read"], 1)
     size = f"{result['bytes'] / 1e6:.3g} MB, {percent:,.1f} % of the input"

@@ -1,5 +1,6 @@
 """Represent triangle meshes, and write them as PLY, OBJ, or GLB; write the means of Gaussians as PLY or CSV."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from clsplat.core.errors import ConfigError, DataError, one_line
 from clsplat.core.files import open_atomic
-from clsplat.formats.gltf_usd import write_primitive
+from clsplat.core.reading import read_file, read_text
+from clsplat.formats.gltf import write_primitive
 from clsplat.formats.packing import open_hashed, write_bytes
-from clsplat.formats.ply import format_ply_header
+from clsplat.formats.ply import format_ply_header, parse_ply_header
 from clsplat.formats.splats import FLIP, MAX_LOG, SH_C0, SplatFile, WriteOptions, normalize_quats, opacities
 
 Floats = NDArray[np.float64]
@@ -60,7 +63,7 @@ def write_ply(path: Path, mesh: Mesh, origin: Floats) -> None:
     columns = (*(mesh.vertices + origin).T, *mesh.normals().T, *mesh.colors.T)
     for name, column in zip(vertices.dtype.names or (), columns, strict=True):
         vertices[name] = column
-    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces = np.empty(len(mesh.faces), TRIANGLE)
     faces["count"], faces["corners"] = 3, mesh.faces
     elements = {
         "vertex": (len(vertices), [name for name, _ in names]),
@@ -104,6 +107,52 @@ def write_glb(path: Path, mesh: Mesh, origin: Floats) -> None:
 
 
 WRITERS: dict[str, Callable[[Path, Mesh, Floats], None]] = {".ply": write_ply, ".obj": write_obj, ".glb": write_glb}
+
+# Meshes for collisions.
+
+TRIANGLE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+FACES = re.compile(rb"\nelement face (\d+)\r?\nproperty list uchar u?int vertex_ind(?:ex|ices)\r?\nend_header")
+
+
+def read_collider(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    """Return the vertices, [V, 3] world coordinates, and the triangles, [F, 3], of a PLY or OBJ file.
+
+    Raises ConfigError, DataError.
+    """
+    read = {".ply": _read_ply, ".obj": _read_obj}.get(path.suffix.lower())
+    if read is None:
+        raise ConfigError(f"--collider {path}: expected a mesh as .ply or .obj, as `clsplat mesh --collision` writes")
+    try:
+        vertices, faces = read(path)
+    except (ValueError, IndexError) as error:
+        raise DataError(f"{path}: {one_line(error)}; export the mesh again, as triangles") from error
+    if not len(faces) or not np.isfinite(vertices).all() or not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise DataError(f"{path}: has no faces, or faces without vertices; export the mesh again")
+    return vertices, faces
+
+
+def _read_ply(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    data = read_file(path, "a mesh")
+    header = parse_ply_header(path, data)
+    match = FACES.search(data, 0, header.start)
+    if header.format != "binary_little_endian" or match is None:
+        raise ValueError("expected a binary little-endian PLY with faces as lists of vertex_indices")
+    vertices = np.frombuffer(data, header.dtype, header.count, header.start)
+    end = header.start + vertices.nbytes
+    rows = np.frombuffer(data, TRIANGLE, int(match[1]), end)
+    if (rows["count"] != 3).any():
+        raise ValueError("expected only triangles")
+    return np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1), rows["corners"].astype(np.int64)
+
+
+def _read_obj(path: Path) -> tuple[Floats, NDArray[np.int64]]:
+    lines = read_text(path, "a mesh").splitlines()
+    vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], np.float64).reshape(-1, 3)
+    faces = [[int(corner.split("/")[0]) for corner in line.split()[1:]] for line in lines if line.startswith("f ")]
+    triangles = [(face[0], *face[i : i + 2]) for face in faces for i in range(1, len(face) - 1)]
+    corners = np.array(triangles, np.int64).reshape(-1, 3)
+    return vertices, np.where(corners < 0, corners + len(vertices), corners - 1)
+
 
 # The means of Gaussians in world coordinates, for programs that cannot show Gaussians.
 

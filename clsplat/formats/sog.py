@@ -333,7 +333,6 @@ SCALE_STEP = 0.1  # of log scales
 COLOR_STEP = 0.05  # of coefficients of band 0; 1 changes a color by 0.28
 BASE_ENTRIES = 1024  # palette entries in training for 1,024 splats; more splats get more entries
 DIGITS = 16  # digits of the SHA-256 in the names of images in a folder
-EPOCH = (1980, 1, 1, 0, 0, 0)  # time of files in the ZIP, fixed so that the same model gives the same bytes
 
 
 def write_sog(path: Path, splats: SplatFile, options: WriteOptions) -> str:
@@ -510,7 +509,7 @@ def _zip(images: dict[str, bytes]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, data in images.items():
-            member = zipfile.ZipInfo(name, EPOCH)
+            member = zipfile.ZipInfo(name, packing.EPOCH)
             member.create_system, member.external_attr = 3, 0o644 << 16
             archive.writestr(member, data)
     return buffer.getvalue()

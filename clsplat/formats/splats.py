@@ -141,6 +141,7 @@ class WriteOptions:
     quality: Quality = "balanced"  # SPZ and SOG
     quiet: bool = False  # do not warn about what the format does not store
     world: bool = False  # positions in world coordinates, instead of an origin
+    collider: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None  # OpenUSD: vertices, world, [V, 3]; faces
 
 
 def sh_coefficients(degree: int) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from clsplat.core.errors import ConfigError, DataError, OutputError, quote, shorten
 from clsplat.core.reading import open_file, require_content
 from clsplat.formats.compressed_ply import is_compressed, read_compressed_ply
-from clsplat.formats.gltf_usd import gltf_files, looks_like_gltf, read_gltf, write_glb, write_usda
+from clsplat.formats.gltf import gltf_files, looks_like_gltf, read_gltf, write_glb
 from clsplat.formats.mesh import write_csv, write_points
 from clsplat.formats.ply import MAX_HEADER, PlyHeader, check_rendering, parse_ply_header, read_ply, write_ply
 from clsplat.formats.sog import META, looks_like_sog, read_sog, sog_folder_files, write_sog
@@ -31,6 +31,7 @@ from clsplat.formats.splats import (
 )
 from clsplat.formats.spz import read_spz, write_spz
 from clsplat.formats.streamed_sog import LOD_META, lod_files, looks_like_lod, read_lod
+from clsplat.formats.usd import looks_like_usd, read_usd, write_usd
 
 # Each format with its functions that recognize, read, and write files.
 
@@ -70,6 +71,7 @@ class Codec:
     has_quality: bool = False  # writing uses WriteOptions.quality
     has_magic: bool = True  # a magic number, or another clear mark at the start of files
     is_model: bool = True  # not only points
+    has_collider: bool = False  # writing uses WriteOptions.collider
 
 
 # The files of a model.
@@ -127,6 +129,16 @@ CODECS = (
         has_quality=True,
     ),
     Codec(
+        "OpenUSD",
+        (".usda", ".usdz"),
+        lambda start: looks_like_usd(start.data),  # before SOG, another ZIP
+        lambda path, options: read_usd(path),
+        write_usd,
+        keeps_mode=False,
+        keeps_origin=True,
+        has_collider=True,
+    ),
+    Codec(
         "SOG",
         (".sog", META),
         lambda start: looks_like_sog(start.data),
@@ -156,15 +168,6 @@ CODECS = (
         (".gltf",),
         lambda start: looks_like_gltf(start.data),
         lambda path, options: read_gltf(path),
-    ),
-    Codec(
-        "OpenUSD",
-        (".usda",),
-        lambda start: start.data.startswith(b"#usda"),
-        None,
-        write_usda,
-        keeps_mode=False,
-        keeps_origin=True,
     ),
     Codec(
         "ksplat",

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import ConfigError, DataError, quote
 from clsplat.core.files import check_not_run_file, path_exists, raising_output_error, scratch_folder
 from clsplat.core.quaternions import rotation_matrix
+from clsplat.formats.mesh import read_collider
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.splats import (
     EXPECTED_TIME,
@@ -38,7 +39,7 @@ from clsplat.gaussians.model import Model, exported_model_path, load, model_path
 from clsplat.gaussians.motion import static_motion, with_motion
 from clsplat.gaussians.sky import sample_texels, sky_path
 from clsplat.scene.scene import PointCloud
-from clsplat.scene.similarity import UP, level
+from clsplat.scene.similarity import UP, Similarity, level
 from clsplat.scene.viewpoint import ground_plane
 
 # Merging models.
@@ -100,9 +101,15 @@ class Changes:
     world: bool = False  # write world coordinates instead of an origin
     sky: SkyForm | None = None  # write a sky as Gaussians, or remove it; None: leave it as it is
     splats: int | None = None  # number of Gaussians, without the sky, to which neighbors are merged
+    collider: Path | None = None  # a mesh in the coordinates of the model, for OpenUSD
 
     def apply(self, model: Model) -> Model:
         """Return the converted model.  Raises DataError if no Gaussian remains, ConfigError for extreme transforms."""
+        return self.apply_with_matrix(model)[0]
+
+    def apply_with_matrix(self, model: Model) -> tuple[Model, NDArray[np.float64]]:
+        """Return the converted model, and the matrix, [4, 4], that moved it in world coordinates."""
+        matrix = np.eye(4) if self.transform is None else self.transform
         model = model if self.time is None else _extract_frame(model, self.time)
         model = without_sky(model) if self.sky == "none" else model
         if self.sky == "splats" and model.sky is None and model.is_scene.all():
@@ -117,7 +124,9 @@ class Changes:
             except ValueError as error:
                 raise ConfigError(f"--transform: {error}") from error
         if self.level:
-            result = leveled(result)
+            similarity = find_leveling(result)
+            result = result.transformed(1.0, similarity.rotation, similarity.translation)
+            matrix = similarity.matrix @ matrix
         if self.crop is not None:
             low, high = np.array(self.crop, np.float64).reshape(2, 3) - result.origin
             is_inside = ((result.means >= low) & (result.means <= high)).all(axis=1)
@@ -129,7 +138,7 @@ class Changes:
         if not len(result):
             fault = f"none of {len(model):,} Gaussians is left; use a larger crop or a lower opacity threshold"
             raise DataError(fault if len(model) else "the model has no Gaussians, or none with valid values")
-        return with_sky_splats(result) if self.sky == "splats" else result
+        return with_sky_splats(result) if self.sky == "splats" else result, matrix
 
 
 def merged(model: Model, count: int) -> Model:
@@ -150,8 +159,8 @@ def solid_means(model: Model) -> NDArray[np.float32]:
     return model.means[model.is_scene & (model.opacities >= SOLID)]
 
 
-def leveled(model: Model) -> Model:
-    """Return a model turned about its center so that its ground is at y = 0 and up is -y.
+def find_leveling(model: Model) -> Similarity:
+    """Return the transform that turns a model about its center so that its ground is at y = 0 and up is -y.
 
     Raises DataError if it has no ground within 45 degrees of level.
     """
@@ -159,7 +168,7 @@ def leveled(model: Model) -> Model:
     up, height = ground_plane(points, UP)
     transform = level(up, np.median(points, axis=0) + model.origin, height + float(up @ model.origin))
     LOG.info("the ground was tilted by %.1f degrees", math.degrees(math.acos(min(1.0, float(up @ UP)))))
-    return model.transformed(1.0, transform.rotation, transform.translation)
+    return transform
 
 
 # Floaters, found without photos.
@@ -233,7 +242,11 @@ def writing_options(out: Path, quality: Quality, changes: Changes) -> WriteOptio
         raise ConfigError(f"--quality {quote(quality)}: expected one of {', '.join(QUALITIES)}")
     if quality != "balanced" and not writing_format(out).has_quality:
         raise ConfigError(f"{out}: --quality is only for SPZ and SOG; use a name that ends in .spz or .sog")
-    return WriteOptions(quality, world=changes.world)
+    if changes.collider is None:
+        return WriteOptions(quality, world=changes.world)
+    if not writing_format(out).has_collider:
+        raise ConfigError(f"{out}: --collider is only for OpenUSD; use a name that ends in .usdz or .usda")
+    return WriteOptions(quality, world=changes.world, collider=read_collider(changes.collider))
 
 
 def convert(
@@ -249,7 +262,11 @@ def convert(
     check_output(sources, out)
     changes = changes or Changes()
     options = writing_options(out, quality, changes)
-    return write_model(sources, changes.apply(read(sources, changes.sky)), out, options)
+    model, matrix = changes.apply_with_matrix(read(sources, changes.sky))
+    if options.collider:
+        vertices, faces = options.collider
+        options = replace(options, collider=(vertices @ matrix[:3, :3].T + matrix[:3, 3], faces))
+    return write_model(sources, model, out, options)
 
 
 def read(sources: Sequence[Path], sky: SkyForm | None = None) -> Model:
@@ -394,8 +411,8 @@ def convert_frames(
     """
     if not 2 <= frames <= MAX_FRAMES:
         raise ConfigError(f"--frames {frames}: expected 2 to {MAX_FRAMES:,} frames; `--time T` writes one")
-    if changes.time is not None:
-        raise ConfigError("--frames and --time cannot be combined; omit one of them")
+    if changes.time is not None or changes.collider:
+        raise ConfigError("--frames cannot be combined with --time or --collider; omit one of them")
     folder, prefix, suffix = _split_name(out)
     digits = max(4, len(str(frames - 1)))
     files = [folder / f"{prefix}{number:0{digits}}{suffix}" for number in range(frames)]

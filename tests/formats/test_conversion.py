@@ -34,15 +34,14 @@ def source(tmp_path, rng):
     return tmp_path / "a.ply"
 
 
-@pytest.mark.parametrize("name", ["b.spz", "b.sog", "b.glb", "b.splat", "b.usda", "f/meta.json"])
+@pytest.mark.parametrize("name", ["b.spz", "b.sog", "b.glb", "b.splat", "b.usda", "b.usdz", "f/meta.json"])
 def test_file_suffix_selects_the_format(name, source, tmp_path):
     done = clsplat.convert(source, tmp_path / name)
     assert done["gaussians"] == 100
     assert done["bytes"] > 0
     assert done["bytes_read"] == source.stat().st_size
-    if name != "b.usda":
-        assert len(clsplat.load(tmp_path / name)) == 100
-        assert detect(tmp_path / name).name == done["format"]
+    assert len(clsplat.load(tmp_path / name)) == 100
+    assert detect(tmp_path / name).name == done["format"]
 
 
 def test_only_files_of_no_run_are_replaced(few_steps, tmp_path):

@@ -101,7 +101,7 @@ def test_each_file_is_read_or_refused_for_its_reason():
     assert not unexpected, "\n".join(unexpected)
     companions = sum(path.name.endswith(NO_MODEL) for path in refused)
     models = [found for found in outcomes().values() if not isinstance(found, str)]
-    assert (len(outcomes()), len(models), len(refused) - companions, companions) == (121, 46, 53, 22)
+    assert (len(outcomes()), len(models), len(refused) - companions, companions) == (121, 49, 53, 19)
     empty = {path.name for path, found in outcomes().items() if not isinstance(found, str) and not len(found)}
     assert empty == EMPTY
 

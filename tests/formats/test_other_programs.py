@@ -1,10 +1,14 @@
 """Points, tables, and pages for programs without Gaussians, opened by other programs' readers."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import clsplat
 from clsplat.core.errors import ConfigError, DataError
+from clsplat.formats.mesh import WRITERS, Mesh
 from clsplat.formats.splats import SH_C0, normalize_quats
 from clsplat.gaussians.model import Model
 from clsplat.pipeline.loading import load
@@ -73,3 +77,103 @@ def test_page_is_that_of_view(model, tmp_path):
     for options in ({"quality": "small"}, {"frames": 3}):
         with pytest.raises(ConfigError, match=r"c\.html: no format has the name 'c\.html'; use a name that ends in"):
             clsplat.convert(tmp_path / "a.ply", tmp_path / "c.html", **options)
+
+
+CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
+def write_cube(path: Path, offset: np.ndarray) -> None:
+    """A cube as PLY, by our writer, or as OBJ with faces of four corners, counted from the end."""
+    if path.suffix == ".ply":
+        faces = np.array([(a, b, c) for q in QUADS for a, b, c in (q[:3], (q[0], *q[2:]))])
+        WRITERS[".ply"](path, Mesh(CUBE, faces, np.zeros((8, 3), np.uint8)), offset)
+    else:
+        lines = [f"v {x} {y} {z}" for x, y, z in (CUBE + offset).tolist()]
+        path.write_text("\n".join([*lines, *("f " + " ".join(f"{i - 8}//1" for i in quad) for quad in QUADS)]))
+
+
+@pytest.mark.parametrize("mesh", ["hull.ply", "hull.obj"])
+def test_collider_is_read_by_usd(mesh, model, tmp_path):
+    """The mesh and the Gaussians move together; axes, unit, schemas, and alignment are as a simulator needs them."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    write_cube(tmp_path / mesh, UTM)
+    options = {"collider": tmp_path / mesh, "transform": "scale=2 rotate=90,0,0 translate=1,2,3"}
+    clsplat.convert(tmp_path / "a.ply", tmp_path / "b.usdz", **options)
+    stage = Usd.Stage.Open(str(tmp_path / "b.usdz"))
+    assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 1)
+    assert stage.GetDefaultPrim().GetPath() == "/Scene"
+    prim, gaussians = (stage.GetPrimAtPath(f"/Scene/{name}") for name in ("Collider", "Gaussians"))
+    assert prim.HasAPI(UsdPhysics.CollisionAPI)
+    assert UsdGeom.Imageable(prim).ComputePurpose() == "guide"
+    assert gaussians.GetTypeName() == "ParticleField3DGaussianSplat"
+    to_world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim))
+    turn = 2 * np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    flip = np.diag([1.0, -1, -1])
+    for attribute, points in ((prim.GetAttribute("points"), CUBE), (gaussians.GetAttribute("positions"), model.means)):
+        expected = ((points + UTM) @ turn.T + [1, 2, 3]) @ flip
+        world = np.array(attribute.Get()).astype(float) @ to_world[:3, :3] + to_world[3, :3]
+        np.testing.assert_allclose(world, expected, atol=1e-5 if points is not CUBE else 1e-6)
+    assert len(prim.GetAttribute("faceVertexCounts").Get()) == 12
+    data = (tmp_path / "b.usdz").read_bytes()
+    assert data.index(b"#usda") == 64, "aligned in the package"
+    copy = clsplat.load(tmp_path / "b.usdz")
+    moved = model.transformed(2.0, turn / 2, (1, 2, 3))
+    np.testing.assert_allclose(copy.means + copy.origin, moved.means + moved.origin, atol=1e-5)
+    np.testing.assert_allclose(copy.sh_rest, moved.sh_rest, atol=1e-6)
+
+
+def test_stages_with_other_axes_units_and_transforms_are_read(model, tmp_path):
+    plain = replace(model, origin=np.zeros(3))
+    plain.save(tmp_path / "b.usda")
+    text = (tmp_path / "b.usda").read_text()
+    order = '    double3 xformOp:translate = (0, 0, 100)\n    uniform token[] xformOpOrder = ["xformOp:translate"]\n'
+    text = text.replace("metersPerUnit = 1", "metersPerUnit = 0.01").replace('upAxis = "Y"', 'upAxis = "Z"')
+    (tmp_path / "c.usda").write_text(text.replace('"Scene"\n{\n', '"Scene" (doc = """} { (""")\n{\n' + order))
+    copy = clsplat.load(tmp_path / "c.usda")
+    x, y, z = (plain.means * [1, -1, -1]).T  # in the stage, z up
+    np.testing.assert_allclose(copy.means, 0.01 * np.stack([x, -(z + 100), y], axis=1), atol=1e-5)
+    np.testing.assert_allclose(np.sort(copy.scales), 0.01 * np.sort(plain.scales), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data.replace(b"opacities", b"opaqueness"), "its Gaussians have no opacities; export it again"),
+        (lambda data: data[:-2], "is damaged, or has values of unknown kinds .*brace"),
+        (lambda data: data.replace(b"scales = [(", b"scales = [(x"), "is damaged, or has values of unknown kinds"),
+        (
+            lambda data: data.replace(b"scales = [(0", b"scales = [(1, 1, 1), (0"),
+            "the attributes of its Gaussians have different counts",
+        ),
+        (lambda data: data.replace(b"Splat ", b"Splats "), "has no prim ParticleField3DGaussianSplat"),
+        (lambda data: b"PXR-USDC" + data, "a binary OpenUSD file; .*usdcat"),
+    ],
+)
+def test_damaged_stages_are_reported(change, message, model, tmp_path):
+    model.save(tmp_path / "b.usda")
+    (tmp_path / "b.usda").write_bytes(change((tmp_path / "b.usda").read_bytes()))
+    with pytest.raises(DataError, match=f"b.usda: {message}"):
+        clsplat.load(tmp_path / "b.usda")
+
+
+def test_invalid_colliders_are_reported(model, tmp_path):
+    write_cube(tmp_path / "hull.ply", UTM)
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nf 1 2 3\n")
+    (tmp_path / "bad.obj").write_text("v 0 0 x\n")
+    (tmp_path / "half.ply").write_bytes((tmp_path / "hull.ply").read_bytes()[:-5])
+    for name, out, message in (
+        ("hull.ply", "b.glb", "b.glb: --collider is only for OpenUSD; use a name that ends in .usdz or .usda"),
+        ("hull.stl", "b.usdz", "hull.stl: expected a mesh as .ply or .obj"),
+        ("none.obj", "b.usdz", "none.obj: cannot be read"),
+        ("flat.obj", "b.usdz", "flat.obj: has no faces, or faces without vertices"),
+        ("bad.obj", "b.usdz", "bad.obj: could not convert string to float"),
+        ("half.ply", "b.usdz", "half.ply: buffer is smaller than requested size"),
+        ("a.ply", "b.usdz", "a.ply: expected a binary little-endian PLY with faces"),
+    ):
+        with pytest.raises((ConfigError, DataError), match=message):
+            clsplat.convert(tmp_path / "a.ply", tmp_path / out, collider=tmp_path / name)
+    with pytest.raises(ConfigError, match="--frames cannot be combined with --time or --collider"):
+        clsplat.convert(tmp_path / "a.ply", tmp_path / "f", frames=3, collider=tmp_path / "hull.ply")

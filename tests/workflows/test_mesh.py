@@ -14,7 +14,7 @@ from clsplat.cli import app
 from clsplat.core.errors import ConfigError, DataError, MemoryLimitError
 from clsplat.data_tools.casting import World
 from clsplat.data_tools.shapes import Cuboid, Sphere, spiral
-from clsplat.formats.gltf_usd import _read_chunks, _to_srgb
+from clsplat.formats.gltf import _read_chunks, _to_srgb
 from clsplat.formats.mesh import WRITERS, Mesh
 from clsplat.render.fusion import DepthImage, count_free, find_blocks, fuse
 from clsplat.scene.camera import Camera

@@ -1,4 +1,4 @@
-"""Read .glb and .gltf files with KHR_gaussian_splatting, and write .glb and text OpenUSD files.
+"""Read .glb and .gltf files with KHR_gaussian_splatting, and write .glb files.
 
     POSITION 3 · ROTATION x y z w, unit · SCALE 3, linear · OPACITY in [0, 1] · SH_DEGREE_l_COEF_m 3, in the order and
     with the signs of f_rest · COLOR_0 r g b a, linear, for viewers without the extension
@@ -12,7 +12,7 @@ import json
 import logging
 import re
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -25,7 +25,7 @@ from clsplat.core.files import is_inside
 from clsplat.core.harmonics import map_colors
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file, read_json
-from clsplat.formats.packing import HashedFile, open_hashed
+from clsplat.formats.packing import open_hashed
 from clsplat.formats.ply import read_extras
 from clsplat.formats.splats import (
     FLIP,
@@ -82,25 +82,11 @@ class Gltf:
         self.primitives = [pair for pair in pairs if _has_gaussians(_extensions(pair[0]))]
         if not self.primitives:
             raise DataError(f"{path}: has no Gaussians ({EXTENSION}); export it again with that extension")
-        placement = FLIP_4 @ self.primitives[0][1] @ FLIP_4
-        self.placement = None if np.allclose(placement, np.eye(4)) else placement  # [4, 4], in the axes of a PLY
 
-    def parameters(self) -> Parameters:
-        """Return the parameters of all Gaussians in the axes of a PLY, without the transform `placement`."""
-        return concatenate([self._transform_primitive(primitive, matrix) for primitive, matrix in self.primitives])
-
-    def _transform_primitive(self, primitive: dict[str, Any], matrix: NDArray[np.float64]) -> Parameters:
-        """Return the Gaussians of a primitive, transformed relative to the first primitive."""
-        part, first = flip_axes(self._read_primitive(primitive)), self.primitives[0][1]
-        if np.allclose(matrix, first, rtol=1e-7):
-            return part
-        relative = FLIP_4 @ np.linalg.inv(first) @ matrix @ FLIP_4
-        scale = float(np.cbrt(np.linalg.det(relative[:3, :3])))
-        try:
-            tables = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
-        except ValueError as error:
-            raise DataError(f"{self.path}: the transform of a node is not supported: {error}") from error
-        return part | {name: table.astype(np.float32) for name, table in tables.items()}
+    def parts(self) -> Iterator[tuple[Parameters, NDArray[np.float64]]]:
+        """Yield the Gaussians of each primitive in the axes of a PLY, and its matrix in the axes of glTF."""
+        for primitive, matrix in self.primitives:
+            yield flip_axes(self._read_primitive(primitive)), matrix
 
     def _read_primitive(self, primitive: dict[str, Any]) -> Parameters:
         """Return the Gaussians of one primitive, in the axes of glTF."""
@@ -286,6 +272,29 @@ class Gltf:
         return sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
 
 
+def join_parts(
+    path: Path, parts: Iterable[tuple[Parameters, NDArray[np.float64]]]
+) -> tuple[Parameters, NDArray[np.float64] | None]:
+    """Return the Gaussians of all parts relative to the first, and the placement of the first, None for the identity.
+
+    parts: Gaussians in the axes of a PLY, and a matrix, [4, 4], in axes with y up and z back.  Raises DataError.
+    """
+    first, joined = None, []
+    for part, matrix in parts:
+        first = matrix if first is None else first
+        if not np.allclose(matrix, first, rtol=1e-7):
+            relative = FLIP_4 @ np.linalg.inv(first) @ matrix @ FLIP_4
+            scale = float(np.cbrt(np.linalg.det(relative[:3, :3])))
+            try:
+                tables = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
+            except ValueError as error:
+                raise DataError(f"{path}: the transform of a node is not supported: {error}") from error
+            part = part | {name: table.astype(np.float32) for name, table in tables.items()}
+        joined.append(part)
+    placement = np.eye(4) if first is None else FLIP_4 @ first @ FLIP_4
+    return concatenate(joined), None if np.allclose(placement, np.eye(4)) else placement
+
+
 def _extensions(primitive: dict[str, Any]) -> dict[str, Any]:
     """Return the extensions of a primitive, including those nested in KHR_gaussian_splatting."""
     extensions: dict[str, Any] = primitive.get("extensions", {})
@@ -353,8 +362,8 @@ def read_gltf(path: Path) -> SplatFile:
     try:
         tree = json.loads(text)
         gltf = Gltf(path, tree, binary)
-        parameters = gltf.parameters()
-        rendering, placement = read_extras(path, tree.get("asset", {})), gltf.placement
+        parameters, placement = join_parts(path, gltf.parts())
+        rendering = read_extras(path, tree.get("asset", {}))
     except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise DataError(
             f"{path}: its JSON is damaged ({type(error).__name__}: {one_line(error)}); copy or export the file again"
@@ -434,12 +443,6 @@ def write_primitive(
     return file.sha256
 
 
-def _origin(splats: SplatFile) -> list[float] | None:
-    """Return the origin of a model, [3], in the axes of glTF, or None if it has none."""
-    origin: list[float] | None = splats.rendering.get("origin")
-    return origin and (np.array(FLIP) * origin).tolist()
-
-
 def _make_attributes(p: Parameters) -> dict[str, NDArray[Any]]:
     """Return the glTF attributes by name, [N, components] float32 or uint8."""
     alpha = opacities(p["logit_opacity"])
@@ -476,61 +479,3 @@ def _read_chunks(path: Path, data: bytes) -> tuple[bytes, bytes]:
     if not text:
         raise DataError(f"{path}: has no JSON chunk; copy or export it again")
     return text, chunks.get(BINARY, b"")
-
-
-# OpenUSD as text: a prim ParticleField3DGaussianSplat (UsdVol 26.03 and later), write only.
-
-BLOCK = 4096  # rows formatted at once
-EXTENT = 3.0  # standard deviations around the means
-USDA_HEADER = """#usda 1.0
-(
-    defaultPrim = "Gaussians"
-    metersPerUnit = 1
-    upAxis = "Y"
-)
-
-def ParticleField3DGaussianSplat "Gaussians"
-{
-    uniform token projectionModeHint = "perspective"
-    uniform token sortingModeHint = "zDepth"
-"""
-
-
-def write_usda(path: Path, splats: SplatFile, options: WriteOptions) -> str:
-    """Write a `.usda` file; return its SHA-256.  Raises OutputError."""
-    require_gaussians(path, splats)
-    p = flip_axes(splats.parameters)
-    scales = np.exp(np.clip(p["log_scales"].astype(np.float64), -80, 80))
-    half_sides = EXTENT * scales.max(axis=1, keepdims=True)
-    extent = np.stack([(p["means"] - half_sides).min(axis=0), (p["means"] + half_sides).max(axis=0)])
-    harmonics = np.concatenate([p["sh_base"], p["sh_rest"]], axis=1).reshape(-1, 3)
-    tables = {
-        "float3[] extent": extent,
-        "point3f[] positions": p["means"],
-        "quatf[] orientations": normalize_quats(p["quats"]),
-        "float3[] scales": scales,
-        "float[] opacities": opacities(p["logit_opacity"]),
-        "float3[] radiance:sphericalHarmonicsCoefficients": harmonics,
-    }
-    with open_hashed(path) as file:
-        file.write(USDA_HEADER.encode())
-        file.write(f"    uniform int radiance:sphericalHarmonicsDegree = {splats.sh_degree}\n".encode())
-        if origin := _origin(splats):
-            file.write(f"    double3 xformOp:translate = {tuple(origin)}\n".encode())
-            file.write(b'    uniform token[] xformOpOrder = ["xformOp:translate"]\n')
-        for name, table in tables.items():
-            _write_array(file, name, table)
-        file.write(b"}\n")
-    return file.sha256
-
-
-def _write_array(file: HashedFile, name: str, table: NDArray[np.floating]) -> None:
-    """Write one attribute with the full precision of float32."""
-    width = table.shape[1]
-    row = ", ".join(["%.9g"] * width) if width == 1 else f"({', '.join(['%.9g'] * width)})"
-    file.write(f"    {name} = [".encode())
-    for start in range(0, len(table), BLOCK):
-        block = table[start : start + BLOCK].astype(np.float32)
-        text = ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
-        file.write((", " if start else "").encode() + text.encode())
-    file.write(b"]\n")
