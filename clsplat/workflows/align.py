@@ -94,17 +94,17 @@ class AlignInput:
             views = self.require_scene("--level cameras").views
             return up_direction(views), np.median([view.position for view in views], axis=0), None
         expected_up = up_direction(self.scene.views) if self.scene else UP
-        if self.scene and self.scene.points:  # also for a run's model, so that its cameras get the same transform
-            points = self.scene.points.positions
-        elif self.model is not None:
-            points = solid_means(self.model)
-        else:
-            raise DataError(f"{self.path}: has no points to find the ground in; use --level cameras")
-        try:
-            up, height = ground_plane(points, expected_up)
-        except DataError as error:
-            raise DataError(f"{self.path}: {error}") from error
-        return up, np.median(points, axis=0).astype(np.float64), height
+        candidates = [self.scene.points.positions] if self.scene and self.scene.points else []
+        candidates += [solid_means(self.model)] if self.model is not None else []
+        error = DataError("has no points to find the ground in; use --level cameras")
+        for points in candidates:  # first the points of the scene, so that a run's model is leveled like its cameras
+            try:
+                up, height = ground_plane(points, expected_up)
+            except DataError as failure:
+                error = failure
+            else:
+                return up, np.median(points, axis=0).astype(np.float64), height
+        raise DataError(f"{self.path}: {error}") from error
 
 
 @dataclass(frozen=True)
