@@ -4,6 +4,7 @@
 
 #define PIXELS (TILE * TILE)
 #define BATCH PIXELS  // splats in local memory: each item loads one
+#define STATE (4 + INVERSE_DEPTH)  // floats of a pixel in front of a bucket: transmittance, color, inverse depth
 #if INVERSE_DEPTH
 #define QUADS 4       // of four floats: the full splat record
 #else
@@ -44,6 +45,32 @@ static inline row_splat_t splat_on_line(const float *splat, const float row, con
 #define SPLAT_AT(splat, row, pixel) splat_at_row(splat, row)
 #endif
 
+/* The number of a bucket of a tile whose pairs start at `first`: no two buckets behind the first one of a tile share
+ * it.  Bucket n contains, or is followed by, the pair n * BUCKET, which is of the same tile. */
+static inline size_t bucket_of(const uint first, const uint begin) { return first / BUCKET + (begin - first) / BUCKET; }
+
+static inline void store_state(__global float *state, const pixels_t *p)
+{
+    state[0] = p->t;
+    state[PIXELS] = p->red;
+    state[2 * PIXELS] = p->green;
+    state[3 * PIXELS] = p->blue;
+#if INVERSE_DEPTH
+    state[4 * PIXELS] = p->inverse_depth;
+#endif
+}
+
+static inline void load_state(__global const float *state, pixels_t *p)
+{
+    p->t = state[0];
+    p->red = state[PIXELS];
+    p->green = state[2 * PIXELS];
+    p->blue = state[3 * PIXELS];
+#if INVERSE_DEPTH
+    p->inverse_depth = state[4 * PIXELS];
+#endif
+}
+
 /* One work-group = one tile, one item = one pixel.  Local memory: BATCH * QUADS * 16 + 4 bytes.  Deterministic. */
 __kernel __attribute__((reqd_work_group_size(PIXELS, 1, 1)))
 void blend_forward(
@@ -56,6 +83,8 @@ void blend_forward(
     __global float *restrict image,             // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
+    __global uint *restrict bucket_tile,        // [capacity/BUCKET+1] tile of the pair at each multiple of BUCKET
+    __global float *restrict states,            // [capacity/BUCKET+1,STATE,PIXELS] in front of buckets
     const uint first_tile)                      // of the launch
 {
     __local float4 batch[BATCH][QUADS];
@@ -67,10 +96,14 @@ void blend_forward(
     const float pixel = column + 0.5f, row = line + 0.5f;
     const uint first = tile_offset[tile], end = tile_offset[tile + 1];
 
+    for (uint bucket = (first + BUCKET - 1) / BUCKET + item; bucket * BUCKET < end; bucket += PIXELS)
+        bucket_tile[bucket] = tile;
     pixels_t p = {1.0f, 0.0f, 0.0f, 0.0f};
     uint begin = first;
     bool unfinished = true;
     for (; begin < end && unfinished; begin += BATCH) {
+        if (begin > first && (begin - first) % BUCKET == 0)
+            store_state(states + bucket_of(first, begin) * (STATE * PIXELS) + item, &p);
         if (item == 0)
             open = 0;
         if (begin + item < end) {
@@ -125,7 +158,10 @@ static inline void write_sums(__global float *pair_sums, const uint pair, const 
         record[k] = vload4(k, sums);
 }
 
-/* One item owns one splat of a batch of PIXELS and adds up the tile's pixels one after another: at step s, item i
+/* One work-group = the first BUCKET pairs of a tile, or a later bucket, whose pixels start from the stored states: the
+ * longest list does not delay the kernel.  Group end_tile + n - 1 takes bucket n, if it exists.
+ *
+ * One item owns one splat of a batch of PIXELS and adds up the tile's pixels one after another: at step s, item i
  * computes pixel s - i, which item i - 1 computed in the previous step, so that every pixel blends its splats front to
  * back.  After the last pixel, an item writes its sums and continues with its splat of the next batch, without
  * waiting.  No atomics, no sums across items.  Local memory, for each pixel: 72 bytes, 76 with a texture, 92 with
@@ -143,21 +179,38 @@ void blend_backward(
     __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
-    const uint first_tile)                      // of the launch
+    __global const uint *restrict bucket_tile,  // [capacity/BUCKET+1]
+    __global const float *restrict states,      // [capacity/BUCKET+1,STATE,PIXELS]
+    const uint first_tile,                      // of the launch; from end_tile on, buckets
+    const uint end_tile)
 {
     __local grad_pixels_t pixels[PIXELS];
     __local float4 coming[PIXELS][QUADS];  // an item's splat of the next batch: only that item reads and writes it
     __local uint coming_pair[PIXELS];
-    const uint item = get_local_id(0), tile = first_tile + get_group_id(0);
+    const uint item = get_local_id(0), group = first_tile + get_group_id(0);
+    const uint bucket = group < end_tile ? 0 : group - end_tile + 1;
+    if (bucket * BUCKET >= tile_offset[camera->tiles_x * camera->tiles_y] && bucket > 0)
+        return;
+    const uint tile = bucket > 0 ? bucket_tile[bucket] : group;
+    const uint start = tile_offset[tile], tile_end = tile_offset[tile + 1];
+    const uint first = start + (bucket > 0 ? (bucket - start / BUCKET) * BUCKET : 0);
+    if (bucket > 0 && (first == start || first >= tile_end))
+        return;
+    const uint end = tile_end - first < BUCKET ? tile_end : first + BUCKET;
+    const uint blended = start + tile_last[tile], last = blended < first ? first : blended < end ? blended : end;
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     const uint at = (tile_y * TILE + item / TILE) * width + tile_x * TILE + item % TILE;
+    pixels_t in_front = {1.0f, 0.0f, 0.0f, 0.0f};
+    if (bucket > 0 && first < last)
+        load_state(states + (size_t)bucket * (STATE * PIXELS) + item, &in_front);
     grad_pixels_t own;
-    own.t = 1.0f;
+    own.t = in_front.t;
     own.red = grad_image[at];
     own.green = grad_image[plane + at];
     own.blue = grad_image[2 * plane + at];
-    own.rest = own.red * image[at] + own.green * image[plane + at] + own.blue * image[2 * plane + at];
+    own.rest = own.red * (image[at] - in_front.red) + own.green * (image[plane + at] - in_front.green) +
+               own.blue * (image[2 * plane + at] - in_front.blue);
 #if GRAD_BEHIND
     own.rest = own.rest + behind[at];
 #endif
@@ -166,12 +219,11 @@ void blend_backward(
 #endif
 #if INVERSE_DEPTH
     own.inverse_depth = grad_image[3 * plane + at];
-    own.rest = own.rest + own.inverse_depth * image[3 * plane + at];
+    own.rest = own.rest + own.inverse_depth * (image[3 * plane + at] - in_front.inverse_depth);
 #endif
     pixels[item] = own;
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    const uint first = tile_offset[tile], end = tile_offset[tile + 1], last = first + tile_last[tile];
     float splat[RECORD];
     pixel_sums_t m = {0.0f};
     uint pair = 0;

@@ -33,6 +33,9 @@
 #ifndef SORT_CAPACITY
 #define SORT_CAPACITY 1024  // pairs of a run that the bitonic sort holds in local memory, 8 bytes each
 #endif
+#ifndef BUCKET
+#define BUCKET 512  // pairs of a tile that one group of the backward pass takes in simt: a multiple of TILE * TILE
+#endif
 #ifndef PIXEL_SUMS
 #define PIXEL_SUMS 9  // sums in a gradient record (splat.h): 11, 13 or 15 if a density statistic needs more
 #endif

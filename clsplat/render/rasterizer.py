@@ -159,6 +159,7 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
 POSE_SUMS, POSE_GROUP = (int(constants("poses.cl")[name]) for name in ("POSE_SUMS", "POSE_GROUP"))
 MAX_PAIRS = 2**31  # sums of pairs have 32 bits
+BUCKET = int(constants()["BUCKET"])
 Content = Literal["color", "depth", "inverse_depth"]
 # color: three planes of color.  depth: the blended depth of the means, alpha, and the median depth (0: none), in scene
 # units.  inverse_depth: the color, and a fourth plane with the blended inverse depth of the means.
@@ -239,7 +240,7 @@ class Rasterizer:
     """Renders one frame at a time, and reuses its buffers."""
 
     def __init__(self, device: Device, sort: Sort = "auto", budget: RenderLimits | None = None) -> None:
-        self.device = device
+        self.device, self._lanes = device, int(device.tuning["LANES"])
         self.budget = budget or RenderLimits(MAX_PAIRS)
         self._limit = min(self.budget.pairs, device.info.allocation // (4 * RECORD), MAX_PAIRS)  # in one buffer
         self._bands: dict[int, int] = {}  # rows of tiles of a frame -> number of bands
@@ -249,7 +250,6 @@ class Rasterizer:
         self._black = device.zeros(3)
         device.program("project.cl")  # compiled now, like the other programs
         self._blend("color")
-        self._lanes = int(device.tuning["LANES"])
         self._gradients: GaussianGradients | None = None  # allocated at first use
 
     def forward(self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content = "color") -> Frame:
@@ -312,15 +312,25 @@ class Rasterizer:
         return Frame(camera, splats, depth_key, radius, lists, *planes, bands, content, model)
 
     def _blend_band(
-        self, model: DeviceModel, camera: DeviceCamera, band: Band, background: Array, content: Content, *splats: Any
+        self,
+        model: DeviceModel,
+        camera: DeviceCamera,
+        band: Band,
+        background: Array,
+        content: Content,
+        *splats: Any,
+        prefix: str = "",
     ) -> tuple[Array, Array, Array]:
-        """Blend a band; return `tile_last`, the image, and the transmittance.  splats: their records and lists."""
+        """Blend a band; return `tile_last`, the image, and the transmittance.
+
+        splats: their records and lists; prefix: of the names of the image and the transmittance in the workspace.
+        """
         records, lists = splats
 
         def blend() -> tuple[Array, Array, Array]:
             array = self.workspace.array
-            image = array("image", (4 if content == "inverse_depth" else 3, camera.rows, camera.stride))
-            transmittance = array("transmittance", (camera.rows, camera.stride))
+            image = array(f"{prefix}image", (4 if content == "inverse_depth" else 3, camera.rows, camera.stride))
+            transmittance = array(f"{prefix}transmittance", (camera.rows, camera.stride))
             tile_last = array("tile_last", camera.tiles, np.uint32)
             for first_tile, groups in self._launches(band):
                 self._blend(content, **model.defines).blend_forward(
@@ -334,16 +344,27 @@ class Rasterizer:
                     image=image,
                     transmittance=transmittance,
                     tile_last=tile_last,
+                    **self._buckets(lists, camera, content),
                     first_tile=first_tile,
                 )
             return tile_last, image, transmittance
 
-        key = "blend", model.key, camera.size, content, band, self.budget.tiles, lists.key
+        key = "blend", model.key, camera.size, content, band, self.budget.tiles, lists.key, prefix
         return self.workspace.plans.run(key, {"camera": camera.array, "background": background}, blend)
+
+    def _buckets(self, lists: TileLists, camera: DeviceCamera, content: Content) -> dict[str, Any]:
+        """Return the arrays with which the backward pass of simt divides long lists, by name; see blend_simt.cl."""
+        if self._lanes > 1:
+            return {}
+        count, floats = lists.capacity // BUCKET + 1, 5 if content == "inverse_depth" else 4
+        return {
+            "bucket_tile": self.workspace.array("bucket_tile", count, np.uint32),
+            "states": self.workspace.array("bucket_states", (count, floats * camera.tile**2)),
+        }
 
     def _blend(self, content: Content, **defines: int) -> Program:
         """Return the blending kernels for the content of a frame, such as depth."""
-        schedule = "simt" if int(self.device.tuning["LANES"]) == 1 else "wide"
+        schedule = "simt" if self._lanes == 1 else "wide"
         return self.device.program(f"blend_{schedule}.cl", **defines, **DEFINES.get(content, {}))
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
@@ -353,10 +374,13 @@ class Rasterizer:
         rows = np.linspace(0, camera.tiles_y, bands + 1).astype(int)
         return [Band(camera.tiles_x, camera.tiles_y, int(begin), int(end)) for begin, end in pairwise(rows)]
 
-    def _launches(self, band: Band) -> list[tuple[int, int]]:
-        """Return the first tile and the number of tiles of each launch; watchdogs may limit the time of a launch."""
-        step = self.budget.tiles or band.tiles_inside
-        end = band.first_tile + band.tiles_inside
+    def _launches(self, band: Band, buckets: int = 0) -> list[tuple[int, int]]:
+        """Return the first tile and the number of tiles of each launch; watchdogs may limit the time of a launch.
+
+        buckets: number of groups after those of the tiles.
+        """
+        step = self.budget.tiles or band.tiles_inside + buckets
+        end = band.first_tile + band.tiles_inside + buckets
         return [(first, min(step, end - first)) for first in range(band.first_tile, end, step)]
 
     def _list_band(
@@ -446,6 +470,9 @@ class Rasterizer:
         for i, band in enumerate(bands):
             if len(bands) > 1:
                 _, lists = self._list_band(frame.model, frame.camera, band, frame.content)
+                if self._lanes == 1:  # the states in front of buckets are those of the last band
+                    inputs = frame.model, frame.camera, band, self._black, frame.content, frame.splats, lists
+                    self._blend_band(*inputs, prefix="second ")
             changes["pair_sums"] = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             flags = {"is_summed": is_summed, "is_first": i == 0, "has_behind": bool(transmittance_gradient)}
             self._sum_band(model, frame, band, lists, pixel_sums, changes, **flags)
@@ -470,7 +497,10 @@ class Rasterizer:
 
         def launch() -> None:
             behind = {"GRAD_BEHIND": 1} if flags["has_behind"] else {}
-            for first_tile, groups in self._launches(band):
+            arguments: dict[str, Any] = self._buckets(lists, frame.camera, frame.content)
+            if arguments:
+                arguments["end_tile"] = band.first_tile + band.tiles_inside
+            for first_tile, groups in self._launches(band, lists.capacity // BUCKET if arguments else 0):
                 self._blend(frame.content, **sum_defines(pixel_sums), **model.defines, **behind).blend_backward(
                     groups=groups,
                     tile_offset=lists.tile_offset,
@@ -480,6 +510,7 @@ class Rasterizer:
                     image=frame.image,
                     tile_last=frame.tile_last,
                     first_tile=first_tile,
+                    **arguments,
                     **changes,
                 )
             pair_sums, accumulate = changes["pair_sums"], int(not flags["is_first"])
@@ -488,7 +519,7 @@ class Rasterizer:
             if frame.content == "inverse_depth":
                 sum_inverse_depths(self.workspace, pair_sums, lists, model.gaussians, accumulate)
 
-        size = frame.camera.size, band, pixel_sums.shape[0], self.budget.tiles
+        size = frame.camera.size, band, pixel_sums.shape[0], self.budget.tiles, lists.capacity
         key = "backward", model.key, frame.key, frame.content, lists.key, size, *flags.values()
         self.workspace.plans.run(key, changes, launch)
 

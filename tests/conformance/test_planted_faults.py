@@ -185,6 +185,11 @@ MORE = {  # that smaller pictures do not show
     "blend_backward simt, the end of the last batch": ("blend_simt.cl", "begin < last + PIXELS &&", "begin < last &&"),
 }
 OPTIONAL = {  # in what few runs compute: doctor notices them, the check before every run has no time for it
+    "blend_backward simt, the color in front of a bucket": (
+        "blend_simt.cl",
+        "p->green = state[2 *",
+        "p->green = state[3 *",
+    ),
     "blend_backward wide, numbers of pixels": ("splat.h", "m->blended += k.blended ?", "m->blended += k.hit ?"),
     "blend_backward simt, squares": (
         "splat.h",

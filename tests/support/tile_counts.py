@@ -1,5 +1,5 @@
-"""Count the work of blending with both sizes of tiles: `python -m tests.support.tile_counts A B` for scenes of
-`clsplat bench`, or `… MODEL SCENE` for a trained model at six of its training views.
+"""Count the work of blending with both sizes of tiles: `python -m tests.support.tile_counts A B RUN …`, for scenes of
+`clsplat bench`, and for trained models at six of their training views.
 
 A line has the mean number of pairs of a view, the median and the longest list of its tiles, the pixels that one pass
 computes, and the share of them inside the ellipse of the splat, where alpha is at least 1/255.
@@ -13,11 +13,11 @@ import numpy as np
 
 from clsplat.conformance.bench.cases import NEAR, SIZES, synthetic_scene
 from clsplat.gaussians.gaussians import Gaussians
-from clsplat.gaussians.model import load as load_model
 from clsplat.opencl.device import Device, constants
 from clsplat.pipeline.loading import load
 from clsplat.render.camera import upload_camera
 from clsplat.render.rasterizer import Rasterizer
+from clsplat.runs.model_file import ModelFile
 from clsplat.scene.quality import near_plane
 from clsplat.scene.view import View
 
@@ -58,25 +58,19 @@ def count(device: Device, tables: dict[str, np.ndarray], views: list[View], near
 
 
 def main(names: list[str]) -> None:
-    cases = {}
-    if names and names[0] not in SIZES:
-        scene, _ = load("splat").settings.scene.read(Path(names[1]))
-        views = list(scene.split("train"))
-        cases[Path(names[0]).stem] = (
-            load_model(Path(names[0])).tables(),
-            views[:: -(-len(views) // VIEWS)],
-            near_plane(scene),
-        )
-        names = []
     for name in names:
-        tables, view = synthetic_scene(*SIZES[name])
-        cases[name] = tables, [view], NEAR
-    for name, (tables, views, near) in cases.items():
+        if name in SIZES:
+            tables, view = synthetic_scene(*SIZES[name])
+            views, near = [view], NEAR
+        else:
+            model = ModelFile(Path(name))
+            tables, views, near = model.gaussians.tables(), model.scene.split("train"), near_plane(model.scene)
+            views = views[:: -(-len(views) // VIEWS)]
         for schedule in ("simt16", "simt"):
             pairs, median, longest, pixels, share = count(Device(None, schedule), dict(tables), views, near)
             print(
-                f"{name}, {len(tables['means']):,} Gaussians, {schedule}: {pairs:,.0f} pairs, lists {median:.0f} and "
-                f"{longest:,.0f}, {pixels / 1e6:.1f} M pixels, {share:.0%} inside"
+                f"{Path(name).name}, {len(tables['means']):,} Gaussians, {schedule}: {pairs:,.0f} pairs, lists "
+                f"{median:.0f} and {longest:,.0f}, {pixels / 1e6:.1f} M pixels, {share:.0%} inside"
             )
 
 

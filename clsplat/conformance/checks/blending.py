@@ -29,7 +29,16 @@ from clsplat.losses.depth import InverseDepth
 from clsplat.opencl.device import Device
 from clsplat.photos.depths import KnownDepths
 from clsplat.render.overlay import backpropagate_composite, composite_layer
-from clsplat.render.rasterizer import INVERSE_DEPTHS, PIXEL_SUMS, RECORD, Frame, Rasterizer, RenderLimits
+from clsplat.render.rasterizer import (
+    BUCKET,
+    INVERSE_DEPTHS,
+    MAX_PAIRS,
+    PIXEL_SUMS,
+    RECORD,
+    Frame,
+    Rasterizer,
+    RenderLimits,
+)
 from clsplat.render.tiles import Sort
 from clsplat.render.workspace import Workspace
 
@@ -131,6 +140,24 @@ def gradients_of_blending(device: Device, rng: np.random.Generator) -> Results:
     yield from check_sum(case, sum_pixels(device, case, weights), weights, "long tiles, finished pixels")
     case = safe_case(rng, 300, 14, 14, 2e-6, make_dim)
     yield from check_sum(case, sum_pixels(device, case, weights), weights, "long tiles, dim pixels")
+
+
+def make_faint(parameters: dict[str, NDArray[Any]]) -> None:
+    """Make splats so faint and large that each pixel blends some 900 of them."""
+    parameters["log_scales"] += 4
+    parameters["logit_opacity"][:] = -4.6
+
+
+@CHECKS.add("blend_backward", "sum_records")
+def gradients_of_long_lists(device: Device, rng: np.random.Generator) -> Results:
+    width, height = 5, 4
+    for count in (BUCKET - 1, BUCKET, BUCKET + 1, 2 * BUCKET):
+        case = random_case(rng, count, width, height)
+        make_faint(case.parameters)
+        weights = rng.normal(size=(3, height, width)).astype(np.float32)
+        for budget in (None, RenderLimits(MAX_PAIRS, 1)):
+            label = f"{count} Gaussians" + (", one group a launch" if budget else "")
+            yield from check_sum(case, sum_pixels(device, case, weights, budget=budget), weights, label)
 
 
 @CHECKS.add("blend_backward", "sum_records")
