@@ -158,6 +158,19 @@ static inline void write_sums(__global float *pair_sums, const uint pair, const 
         record[k] = vload4(k, sums);
 }
 
+/* Find the first and the end of the pairs of a bucket, and the end of those that a pixel may blend; bucket 0 is the
+ * first one of each tile.  There are none if the tile does not have the bucket. */
+static inline void find_pairs(__global const uint *offset, const uint tile_last, const uint bucket, uint *first,
+                              uint *last, uint *end)
+{
+    const uint start = offset[0], tile_end = offset[1], blended = start + tile_last;
+    *first = start + (bucket > 0 ? (bucket - start / BUCKET) * BUCKET : 0);
+    *end = tile_end < *first + BUCKET ? tile_end : *first + BUCKET;
+    *last = blended < *first ? *first : blended < *end ? blended : *end;
+    if (bucket > 0 && (*first == start || *first >= tile_end))
+        *last = *end = *first;
+}
+
 /* One work-group = the first BUCKET pairs of a tile, or a later bucket, whose pixels start from the stored states: the
  * longest list does not delay the kernel.  Group end_tile + n - 1 takes bucket n, if it exists.
  *
@@ -189,15 +202,10 @@ void blend_backward(
     __local uint coming_pair[PIXELS];
     const uint item = get_local_id(0), group = first_tile + get_group_id(0);
     const uint bucket = group < end_tile ? 0 : group - end_tile + 1;
-    if (bucket * BUCKET >= tile_offset[camera->tiles_x * camera->tiles_y] && bucket > 0)
-        return;
-    const uint tile = bucket > 0 ? bucket_tile[bucket] : group;
-    const uint start = tile_offset[tile], tile_end = tile_offset[tile + 1];
-    const uint first = start + (bucket > 0 ? (bucket - start / BUCKET) * BUCKET : 0);
-    if (bucket > 0 && (first == start || first >= tile_end))
-        return;
-    const uint end = tile_end - first < BUCKET ? tile_end : first + BUCKET;
-    const uint blended = start + tile_last[tile], last = blended < first ? first : blended < end ? blended : end;
+    const bool beyond = bucket * BUCKET >= tile_offset[camera->tiles_x * camera->tiles_y];
+    const uint tile = bucket == 0 ? group : beyond ? 0 : bucket_tile[bucket];
+    uint first, last, end;
+    find_pairs(tile_offset + tile, tile_last[tile], bucket, &first, &last, &end);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
     const uint width = camera->tiles_x * TILE, plane = width * camera->tiles_y * TILE;
     const uint at = (tile_y * TILE + item / TILE) * width + tile_x * TILE + item % TILE;

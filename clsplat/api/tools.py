@@ -102,6 +102,22 @@ def measure_speed(
     )
 
 
+def report_device(out: PathLike, scenes: Sequence[str] = ("A",), device: "str | Device | None" = None) -> None:
+    """Check and time a device with each schedule for its kind, and write the results to a JSON file.
+
+    The file has the report of `doctor`, and the measurements by schedule.  Raises OutputError.
+    """
+    import json
+
+    from clsplat.core.files import check_result_path, write_text
+
+    check_result_path(Path(out), ".json")
+    checks = doctor(device)
+    schedules = [s for s in checks.schedules if (s == "wide") == (checks.default == "wide") and not checks.failures[s]]
+    times = {s: measure_speed(scenes, schedule=s, device=device).data() for s in schedules}  # type: ignore[arg-type]
+    write_text(Path(out), json.dumps({"doctor": checks.data(), "bench": times}, indent=1) + "\n")
+
+
 def read_measurement(file: PathLike, pipeline: PathLike = "splat") -> dict[str, Any]:
     """Read the `data()` of an earlier measurement of the same pipeline from a JSON file, for comparison."""
     from clsplat.conformance.bench import measurement

@@ -128,6 +128,10 @@ def bench(
     schedule: Annotated[
         Literal["auto", "simt", "simt16", "wide"], typer.Option(help="wide for CPUs; simt and simt16 for GPUs.")
     ] = "auto",
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Check and time the device with all its schedules, and write JSON."),
+    ] = None,
     device: DeviceOption = None,
 ) -> None:
     """Time the stages of a training step on fixed scenes, next to the measured peaks of the device."""
@@ -135,6 +139,9 @@ def bench(
         terminal.keep_stdout_for_json()
     baseline = tools.read_measurement(against, pipeline) if against else {}
     names = [name for name in scenes.split(",") if name]
+    if report:
+        tools.report_device(report, names, device)
+        return
     measurement = tools.measure_speed(
         names, model=model, scene=scene, pipeline=pipeline, repeats=repeats, schedule=schedule, device=device
     )

@@ -471,8 +471,8 @@ class Rasterizer:
             if len(bands) > 1:
                 _, lists = self._list_band(frame.model, frame.camera, band, frame.content)
                 if self._lanes == 1:  # the states in front of buckets are those of the last band
-                    inputs = frame.model, frame.camera, band, self._black, frame.content, frame.splats, lists
-                    self._blend_band(*inputs, prefix="second ")
+                    frame_inputs = frame.model, frame.camera, band, self._black, frame.content, frame.splats, lists
+                    self._blend_band(*frame_inputs, prefix="second ")
             changes["pair_sums"] = self.workspace.array("pair_sums", (lists.pairs, RECORD))
             flags = {"is_summed": is_summed, "is_first": i == 0, "has_behind": bool(transmittance_gradient)}
             self._sum_band(model, frame, band, lists, pixel_sums, changes, **flags)

@@ -2,10 +2,12 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from clsplat.api import tools
 from clsplat.conformance.bench.cases import (
     BenchCase,
     BenchResult,
@@ -169,3 +171,14 @@ def test_table_of_a_scene_has_a_row_for_each_stage():
     ]
     assert [line[0] for line in lines[4:]] == ["host", "step", "steps", "densify", "memory"]
     assert table("A", result, None).splitlines()[1].split() == ["stage", "ms", "floor", "ratio"]
+
+
+def test_report_has_the_checks_and_the_times_of_each_schedule(monkeypatch, tmp_path):
+    failures = {"simt": [], "simt16": ["wrong"], "wide": []}
+    checks = SimpleNamespace(default="simt", schedules=failures, failures=failures, data=lambda: {"verdict": "use it"})
+    monkeypatch.setattr(tools, "doctor", lambda device: checks)
+    times = SimpleNamespace(data=lambda: {"step": 1.0})
+    monkeypatch.setattr(tools, "measure_speed", lambda *_, **__: times)
+    tools.report_device(tmp_path / "gpu.json", ["A"])
+    expected = {"doctor": {"verdict": "use it"}, "bench": {"simt": {"step": 1.0}}}
+    assert json.loads((tmp_path / "gpu.json").read_text()) == expected
