@@ -10,7 +10,10 @@ from clsplat.core.schedule import at_step
 from clsplat.losses.base import Comparison, ImageLoss, LossValue
 from clsplat.opencl.device import Array, constants
 
-SSIM_BLOCK = int(constants("loss.cl")["BLOCK"])
+SSIM_BLOCKS = {  # columns and rows of a group
+    schedule: tuple(int(constants("loss.cl")[f"{schedule.upper()}_{name}"]) for name in ("COLUMNS", "ROWS"))
+    for schedule in ("wide", "simt")
+}
 SSIM_PIXELS_MAX = 2**32 // 9  # the kernels index nine planes in 32 bits
 
 
@@ -102,7 +105,7 @@ def add_ssim_gradient(comparison: Comparison, arguments: dict[str, Any]) -> Arra
     """Add the gradient of the SSIM, times the argument `scale`; return the sums of `ssim_maps`."""
     maps, sums = ssim_maps(comparison)
     comparison.workspace.device.program("loss.cl").ssim_gradient(
-        groups=(-(-comparison.camera.stride // SSIM_BLOCK), comparison.camera.rows, 3),
+        groups=(*_ssim_blocks(comparison, comparison.camera.rows), 3),
         maps=maps,
         **arguments,
         **comparison.camera.plane_arguments(),
@@ -111,7 +114,7 @@ def add_ssim_gradient(comparison: Comparison, arguments: dict[str, Any]) -> Arra
 
 
 def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
-    """Return the derivatives of the SSIM map, [3, 3, rows, stride], and the map's sums, [3, height, blocks].
+    """Return the derivatives of the SSIM map, [3, 3, rows, stride], and the map's sums, [3, blocks].
 
     Raises DataError for images of more than SSIM_PIXELS_MAX pixels, rounded up to full tiles.
     """
@@ -121,11 +124,11 @@ def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
             f"an image of {camera.width}x{camera.height} pixels is too large for SSIM (at most {SSIM_PIXELS_MAX:,}); "
             "downscale it"
         )
-    blocks = -(-camera.stride // SSIM_BLOCK)
+    blocks = _ssim_blocks(comparison, camera.height)
     maps = array("ssim_maps", (3, 3, camera.rows, camera.stride))
-    sums = array("ssim_sums", (3, camera.height, blocks))
+    sums = array("ssim_sums", (3, math.prod(blocks)))
     comparison.workspace.device.program("loss.cl").ssim_maps(
-        groups=(blocks, camera.height, 3),
+        groups=(*blocks, 3),
         image=comparison.image,
         photograph=comparison.photograph,
         maps=maps,
@@ -133,3 +136,11 @@ def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
         **comparison.camera.plane_arguments(),
     )
     return maps, sums
+
+
+def _ssim_blocks(comparison: Comparison, rows: int) -> tuple[int, int]:
+    """Return the number of blocks of the SSIM kernels across the planes, and down to a row."""
+    columns_per_block, rows_per_block = SSIM_BLOCKS[
+        "wide" if comparison.workspace.device.schedule == "wide" else "simt"
+    ]
+    return -(-comparison.camera.stride // columns_per_block), -(-rows // rows_per_block)
