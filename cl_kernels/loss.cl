@@ -126,6 +126,20 @@ void pixel_loss(
     }
 }
 
+/* The place of a block's sum. */
+static inline uint block_index(const uint channel)
+{
+    return (channel * get_num_groups(1) + get_group_id(1)) * get_num_groups(0) + get_group_id(0);
+}
+
+static inline float sum_team(__local const float *sums)  // [SSIM_TEAM]
+{
+    float sum = 0.0f;
+    for (uint i = 0; i < SSIM_TEAM; i++)
+        sum += sums[i];
+    return sum;
+}
+
 /* Local means, then the derivatives of the SSIM map with respect to mean of x, variance of x and covariance:
  *   a1 = 2 mx my + C1, a2 = 2 cov + C2, b1 = mx^2 + my^2 + C1, b2 = vx + vy + C2, m = a1 a2 / (b1 b2).
  * Local memory: ROWS * SPAN * 20 bytes + SSIM_TEAM * 4. */
@@ -206,23 +220,22 @@ void ssim_maps(
     }
     sums[item] = sum_lanes(total);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) {
-        float sum = 0.0f;
-        for (uint i = 0; i < SSIM_TEAM; i++)
-            sum += sums[i];
-        block_sums[(channel * get_num_groups(1) + get_group_id(1)) * get_num_groups(0) + get_group_id(0)] = sum;
-    }
+    if (item == 0)
+        block_sums[block_index(channel)] = sum_team(sums);
 }
 
-/* gradient (+)= scale (W * d_mean + 2 x (W * d_variance) + y (W * d_covariance)), W * the window.
- * Local memory: ROWS * SPAN * 12 bytes. */
+/* gradient (+)= l1 sign(x - y) + scale (W * d_mean + 2 x (W * d_variance) + y (W * d_covariance)), W * the window.
+ * Local memory: ROWS * SPAN * 12 bytes + SSIM_TEAM * 4. */
 __kernel __attribute__((reqd_work_group_size(SSIM_TEAM, 1, 1)))
 void ssim_gradient(
     __global const float *restrict maps,        // [3,3,H',stride]
     __global const float *restrict image,       // [3,H',stride]
     __global const float *restrict photograph,  // [3,H',stride]
     __global float *restrict gradient,          // [3,H',stride]
+    __global float *restrict absolute_sums,     // [3,blocks] sums of |x - y|, if `has_l1`
     const float scale,                          // -weight / values in the image, for 1 - mean SSIM
+    const float l1,                             // weight / values in the image
+    const uint has_l1,
     const uint accumulate,                      // 0: overwrite the gradient
     const uint width,
     const uint height,
@@ -230,6 +243,7 @@ void ssim_gradient(
     const uint stride)
 {
     __local float vertical[3][ROWS][SPAN];
+    __local float sums[SSIM_TEAM];
     const uint item = get_local_id(0), channel = get_group_id(2);
     const uint plane = rows * stride, left = get_group_id(0) * COLUMNS, top = get_group_id(1) * ROWS;
     const VF zero = (VF)(0.0f);
@@ -262,6 +276,7 @@ void ssim_gradient(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
+    VF absolute = zero;
     for (uint part = item; part < ROWS * (COLUMNS / LANES); part += SSIM_TEAM) {
         const uint v = part % (COLUMNS / LANES) * LANES, row = part / (COLUMNS / LANES), y = top + row;
         if (y >= rows || left + v >= stride)
@@ -274,10 +289,23 @@ void ssim_gradient(
             covariance += WINDOW[k] * VLOAD_LOCAL(vertical[2][row] + at);
         }
         const uint at = channel * plane + y * stride + left + v;
-        const VF g = (scale * inside_row(left + v, y < height ? width : 0)) *
-                     (mean + 2.0f * VLOAD(image + at) * variance + VLOAD(photograph + at) * covariance);
-        VSTORE((accumulate ? VLOAD(gradient + at) + g : g), gradient + at);
+        const VF inside = inside_row(left + v, y < height ? width : 0);
+        const VF a = VLOAD(image + at), b = VLOAD(photograph + at);
+        VF before = accumulate ? VLOAD(gradient + at) : zero;
+        if (has_l1) {
+            const VF difference = a - b, part_l1 = l1 * inside;
+            before += difference > 0.0f ? part_l1 : (difference < 0.0f ? -part_l1 : zero);
+            absolute += magnitude(difference) * inside;
+        }
+        const VF g = (scale * inside) * (mean + 2.0f * a * variance + b * covariance);
+        VSTORE((accumulate | has_l1 ? before + g : g), gradient + at);
     }
+    if (!has_l1)
+        return;
+    sums[item] = sum_lanes(absolute);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0)
+        absolute_sums[block_index(channel)] = sum_team(sums);
 }
 
 /* The error of a view, weighted by the gradient of its loss: sums of |gradient (x - y)|, by row.

@@ -1,13 +1,14 @@
 """Define the photometric losses L1, L2, and D-SSIM."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from clsplat.core.errors import DataError
 from clsplat.core.schedule import at_step
-from clsplat.losses.base import Comparison, ImageLoss, LossValue
+from clsplat.losses.base import Comparison, ImageLoss, LossValue, require_loss_value
 from clsplat.opencl.device import Array, constants
 
 SSIM_BLOCKS = {  # columns and rows of a group
@@ -51,12 +52,32 @@ class Dssim(ImageLoss):
     type: Literal["dssim"] = "dssim"
 
     def add(self, comparison: Comparison) -> LossValue:
-        weight = at_step(self.weight, comparison.step)
-        arguments = {**comparison.arguments(), "scale": -weight / comparison.size}
-        key = "dssim", comparison.camera.size
-        sums = comparison.workspace.plans.run(key, arguments, add_ssim_gradient, comparison, arguments)
+        return self.add_with(comparison, None)[0]
+
+    def add_with(self, comparison: Comparison, l1: L1 | None) -> list[LossValue]:
+        """Add the gradients of this loss and of an L1 before it in one pass over the image; return their values."""
+        weight, size = at_step(self.weight, comparison.step), comparison.size
+        l1_weight = at_step(l1.weight, comparison.step) if l1 else 0.0
+        factors = {"scale": -weight / size, "l1": l1_weight / size, "has_l1": int(l1 is not None)}
+        arguments, key = {**comparison.arguments(), **factors}, ("dssim", comparison.camera.size)
+        sums, absolute = comparison.workspace.plans.run(key, arguments, add_ssim_gradient, comparison, arguments)
         comparison.accumulate = True
-        return LossValue("dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / comparison.size))
+        value = LossValue("dssim", lambda: weight * (1.0 - float(sums.get().sum(dtype=np.float64)) / size))
+        l1_value = LossValue("l1", lambda: l1_weight * float(absolute.get().sum(dtype=np.float64)) / size)
+        return [l1_value, value] if l1 else [value]
+
+
+def add_losses(losses: Sequence[ImageLoss], comparison: Comparison) -> list[LossValue]:
+    """Add the gradients of losses, in this order; return their values.  The SSIM kernel also adds an L1 before it."""
+    values, remaining = list[LossValue](), list(losses)
+    while remaining:
+        loss, following = remaining.pop(0), remaining[0] if remaining else None
+        if type(loss) is L1 and type(following) is Dssim:
+            values += following.add_with(comparison, loss)
+            del remaining[0]
+        else:
+            values.append(require_loss_value(loss, loss.add(comparison)))
+    return values
 
 
 def pixel_loss(comparison: Comparison, l1: float, l2: float) -> Array:
@@ -101,16 +122,22 @@ def view_error(comparison: Comparison) -> Array:
     return error
 
 
-def add_ssim_gradient(comparison: Comparison, arguments: dict[str, Any]) -> Array:
-    """Add the gradient of the SSIM, times the argument `scale`; return the sums of `ssim_maps`."""
+def add_ssim_gradient(comparison: Comparison, arguments: dict[str, Any]) -> tuple[Array, Array]:
+    """Add the gradients of the SSIM, times the argument `scale`, and of the L1, times `l1` if `has_l1`.
+
+    Returns the sums of `ssim_maps`, and those of |x - y|, [3, blocks], if `has_l1`.
+    """
     maps, sums = ssim_maps(comparison)
+    blocks = _ssim_blocks(comparison, comparison.camera.rows)
+    absolute = comparison.workspace.array("l1_sums", (3, math.prod(blocks)))
     comparison.workspace.device.program("loss.cl").ssim_gradient(
-        groups=(*_ssim_blocks(comparison, comparison.camera.rows), 3),
+        groups=(*blocks, 3),
         maps=maps,
+        absolute_sums=absolute,
         **arguments,
         **comparison.camera.plane_arguments(),
     )
-    return sums
+    return sums, absolute
 
 
 def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:

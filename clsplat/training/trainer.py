@@ -17,6 +17,7 @@ from clsplat.losses.base import (
     require_loss_value,
     required_content,
 )
+from clsplat.losses.image import add_losses
 from clsplat.opencl.device import Array, constants
 from clsplat.photos.photographs import Photograph, apply_mask, unmasked_gradient
 from clsplat.photos.transforms import PhotographTransform
@@ -121,9 +122,7 @@ class StepTrainer:
             apply_mask(workspace, camera, target, mask)
         for module in data.modules:
             module.before_losses(data)
-        data.losses += [
-            require_loss_value(loss, loss.add(comparison)) for loss in self.losses if isinstance(loss, ImageLoss)
-        ]
+        data.losses += add_losses([loss for loss in self.losses if isinstance(loss, ImageLoss)], comparison)
         data.losses += data.module_losses
         return ViewLosses(data.frame, comparison, data.losses, step=data)
 

@@ -11,7 +11,7 @@ from clsplat.conformance.checks.images import image_pair as images
 from clsplat.core.errors import DataError
 from clsplat.core.settings import variants
 from clsplat.losses.base import ImageLoss
-from clsplat.losses.image import L1, L2, Dssim, ssim_maps
+from clsplat.losses.image import L1, L2, Dssim, add_losses, ssim_maps
 from clsplat.photos.photographs import Photograph, apply_mask, unpack
 from clsplat.render.workspace import Workspace
 from tests.support.deviations import assert_within_bounds
@@ -45,6 +45,20 @@ def test_losses_add_up(device, rng):
     x, y = x.astype(np.float64), y.astype(np.float64)
     expected = 0.8 * ref.l1(x, y)[1] + 0.2 * ref.dssim(x, y)[1] + 3 * ref.l2(x, y)[1]
     np.testing.assert_allclose(gradient_of(comparison), expected, atol=2e-4 * np.abs(expected).max())
+
+
+@on_devices("width, height", SIZES)
+def test_l1_in_the_ssim_kernel_equals_separate_kernels(device, rng, width, height):
+    """Bit for bit, in each order with an L2."""
+    x, y = images(rng, width, height)
+    l1, dssim, l2 = L1(weight=0.8), Dssim(weight=0.2), L2(weight=3.0)
+    for losses in ([l1, dssim], [l2, l1, dssim], [l1, dssim, l2]):
+        together, separate = make_comparison(device, x, y), make_comparison(device, x, y)
+        values = add_losses(losses, together)
+        assert [value.name for value in values] == [loss.type for loss in losses]
+        expected = [loss.add(separate).value() for loss in losses]
+        assert [value.value() for value in values] == pytest.approx(expected, rel=1e-6)
+        np.testing.assert_array_equal(together.gradient.get(), separate.gradient.get())
 
 
 @on_one_setting
