@@ -164,7 +164,10 @@ class StepTrainer:
         gaussians, has_depth = self.model.gaussians, view_gradients.frame.content == "inverse_depth"
         has_several_views = self.views_per_update != 1
         if not (penalties or frozen or gaussians.is_moving or has_depth or has_several_views):
-            sums = view_gradients.sums if self.stats.is_in_update else view_gradients.pixel_sums
+            is_fused = (
+                self.stats.is_in_update and self.rasterizer.device.schedule != "wide"
+            )  # CPUs sum faster separately
+            sums = view_gradients.sums if is_fused else view_gradients.pixel_sums
             inputs = self.model, view_gradients.frame, sums, rates, self.rows
             return self.adam.update(*inputs, self.stats.update_arguments()), True
         gradients = self.rasterizer.gradients(self.model, view_gradients.frame, view_gradients.pixel_sums)
