@@ -12,7 +12,7 @@ from clsplat.losses.base import Comparison, ImageLoss, LossValue, require_loss_v
 from clsplat.opencl.device import Array, constants
 
 SSIM_BLOCKS = {  # columns and rows of a group
-    schedule: tuple(int(constants("loss.cl")[f"{schedule.upper()}_{name}"]) for name in ("COLUMNS", "ROWS"))
+    schedule: tuple(int(constants("ssim.cl")[f"{schedule.upper()}_{name}"]) for name in ("COLUMNS", "ROWS"))
     for schedule in ("wide", "simt")
 }
 SSIM_PIXELS_MAX = 2**32 // 9  # the kernels index nine planes in 32 bits
@@ -130,7 +130,7 @@ def add_ssim_gradient(comparison: Comparison, arguments: dict[str, Any]) -> tupl
     maps, sums = ssim_maps(comparison)
     blocks = _ssim_blocks(comparison, comparison.camera.rows)
     absolute = comparison.workspace.array("l1_sums", (3, math.prod(blocks)))
-    comparison.workspace.device.program("loss.cl").ssim_gradient(
+    comparison.workspace.device.program("ssim.cl").ssim_gradient(
         groups=(*blocks, 3),
         maps=maps,
         absolute_sums=absolute,
@@ -154,7 +154,7 @@ def ssim_maps(comparison: Comparison) -> tuple[Array, Array]:
     blocks = _ssim_blocks(comparison, camera.height)
     maps = array("ssim_maps", (3, 3, camera.rows, camera.stride))
     sums = array("ssim_sums", (3, math.prod(blocks)))
-    comparison.workspace.device.program("loss.cl").ssim_maps(
+    comparison.workspace.device.program("ssim.cl").ssim_maps(
         groups=(*blocks, 3),
         image=comparison.image,
         photograph=comparison.photograph,
