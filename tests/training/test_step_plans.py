@@ -16,7 +16,7 @@ MODULES = (
 )
 PENALTIES = (
     "optimize.losses=[{type: l1, weight: [[1, 0.8], [20, 0.7]]}, {type: dssim, weight: 0.2}, "
-    "{type: anisotropy, above: 2.0, weight: 0.01}]"
+    "{type: l2, weight: 0.1}, {type: anisotropy, above: 2.0, weight: 0.01}]"
 )
 CASES = {
     "edits": (),
@@ -30,8 +30,10 @@ CASES = {
 def test_replays_are_the_launches_of_the_checked_path(tiny_scene, tmp_path, monkeypatch, overrides):
     compared = check_replays(monkeypatch)
     train(tiny_scene, tmp_path / "run", *STEPS, *overrides)
-    parts = {"project", "order", "lists", "blend", "backward", "unpack", "pixel loss", "dssim"}
-    assert parts | ({"gradients", "statistics"} if PENALTIES in overrides else {"update"}) <= compared.keys()
+    parts = {"project", "order", "lists", "blend", "backward", "unpack", "dssim"}
+    assert (
+        parts | ({"gradients", "statistics", "pixel loss"} if PENALTIES in overrides else {"update"}) <= compared.keys()
+    )
 
 
 @on_devices("sort", ["radix", "bitonic", "radix"])
