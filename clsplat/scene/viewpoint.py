@@ -21,6 +21,7 @@ START_CAMERA = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a sc
 QUANTILES = 0.05, 0.95  # of the splats along each axis: the faces of the box to look at
 DISTANCE = 2.2  # of the start view from the center of the box, divided by half the diagonal of the box
 TOWARD_START = np.array([0.35, -0.25, -0.9])  # from the center
+NO_GROUND = "omit --level, or level by the cameras of a scene with `clsplat align`"
 VISIBLE_FRACTION, MARGIN = 0.999, 1.05  # of the splats in the start view, and the space around them
 MAX_ZOOM_OUT = 2.0  # times the distance; splats that need more have a background, which may be outside the image
 
@@ -125,7 +126,7 @@ def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tupl
     points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     points = points[rng.permutation(len(points))[:PLANE_POINTS]]
     if len(points) < 3:
-        raise DataError("there are too few points to find the ground; use --level cameras")
+        raise DataError(f"there are too few points to find the ground; {NO_GROUND}")
     center, thickness = np.median(points, axis=0), THICKNESS * typical_size(points)
     points = points - center
     a, b, c = points[rng.integers(len(points), size=(3, PLANES))]
@@ -135,16 +136,14 @@ def ground_plane(points: NDArray[np.floating], up: NDArray[np.floating]) -> tupl
     is_level = np.abs(cosines) >= np.cos(MAX_SLOPE)
     normals, a = (normals * np.sign(cosines)[:, None])[is_level], a[is_level]
     if not len(normals):
-        raise DataError("no plane through the points is within 45 degrees of level; use --level cameras")
+        raise DataError(f"no plane through the points is within 45 degrees of level; {NO_GROUND}")
     heights = normals @ points.T - (normals * a).sum(axis=1, keepdims=True)
     scores = (np.abs(heights) < thickness).sum(axis=1) - (heights < -3 * thickness).sum(axis=1)
     normal, height = normals[scores.argmax()], float(normals[scores.argmax()] @ a[scores.argmax()])
     for _ in range(REFINEMENTS):
         ground = points[np.abs(points @ normal - height) < 2 * thickness]
         if len(ground) < max(3, MIN_GROUND * len(points)) or normal @ up < np.cos(MAX_SLOPE):
-            raise DataError(
-                f"only {len(ground) / len(points):.1%} of the points are on a level plane; use --level cameras"
-            )
+            raise DataError(f"only {len(ground) / len(points):.1%} of the points are on a level plane; {NO_GROUND}")
         axis = np.linalg.svd(ground - ground.mean(axis=0), full_matrices=False)[2][2]
         normal = axis if axis @ normal > 0 else -axis
         height = float(normal @ ground.mean(axis=0))
