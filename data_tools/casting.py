@@ -62,12 +62,13 @@ class World:
         sample: the index of the sample in its pixel, which selects the directions of these rays
         """
         count = self.grid * self.grid
-        key, sky = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T  # far apart in neighboring samples
+        # far apart in neighboring samples
+        key_sample, sky_sample = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T
         normal = self.by_shape(Shape.normal, index, points)
         start = points + SURFACE_OFFSET * normal
-        to_key = normalize(align(KEY_DIRECTION, KEY_WIDTH * key[0], KEY_WIDTH * key[1], 1.0))
+        to_key = normalize(align(KEY_DIRECTION, KEY_WIDTH * key_sample[0], KEY_WIDTH * key_sample[1], 1.0))
         key_light = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
-        to_sky = align(normal, sky[0], sky[1], np.sqrt(1 - dot(sky, sky)))
+        to_sky = align(normal, sky_sample[0], sky_sample[1], np.sqrt(1 - dot(sky_sample, sky_sample)))
         occluders = self if self.canopy is None else replace(self, shapes=self.canopy)
         distance, blocker = occluders.trace(start, to_sky)
         light = SKY_LIGHT * (0.75 + 0.25 * normal[2])

@@ -77,8 +77,8 @@ def sphere_interval(origins: Array, directions: Array, radius: float) -> tuple[A
 def slab_interval(origins: Array, directions: Array, half: float) -> tuple[Array, Array]:
     """Return the distances (enter, leave) between which one coordinate of rays is within `half` of 0."""
     inverse = 1 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
-    center, reach = -origins * inverse, half * np.abs(inverse)
-    return center - reach, center + reach
+    center, half_span = -origins * inverse, half * np.abs(inverse)
+    return center - half_span, center + half_span
 
 
 def intersect_intervals(*intervals: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -97,7 +97,7 @@ class Shape:
     tilt: float = 0.0
 
     @property
-    def reach(self) -> float:
+    def bounding_radius(self) -> float:
         """Radius of the bounding sphere."""
         raise NotImplementedError
 
@@ -123,7 +123,7 @@ class Shape:
     def intersect(self, origins: Array, directions: Array) -> Array:
         """Return the distance along each ray to the surface of the shape, [R], or inf for a miss."""
         offset = origins - np.array(self.center)[:, None]
-        along, square = dot(offset, directions), dot(offset, offset) - self.reach**2
+        along, square = dot(offset, directions), dot(offset, offset) - self.bounding_radius**2
         near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # through the bounding sphere
         distance = np.full(along.shape, np.inf)
         offset, directions = (np.broadcast_to(v, (3, len(along)))[:, near] for v in (offset, directions))
@@ -148,7 +148,7 @@ class Sphere(Shape):
     radius: float
 
     @property
-    def reach(self) -> float:
+    def bounding_radius(self) -> float:
         return self.radius
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
@@ -165,7 +165,7 @@ class Cuboid(Shape):
     half: Vector
 
     @property
-    def reach(self) -> float:
+    def bounding_radius(self) -> float:
         return float(np.linalg.norm(self.half))
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:
@@ -184,7 +184,7 @@ class Cylinder(Shape):
     half: float
 
     @property
-    def reach(self) -> float:
+    def bounding_radius(self) -> float:
         return float(np.hypot(self.radius, self.half))
 
     def interval(self, origins: Array, directions: Array) -> tuple[Array, Array]:

@@ -95,7 +95,7 @@ class RenderResult:
         depth: dL/d depth, [height, width] in 1 / scene units; it is ignored where alpha is 0
 
         This method can be called repeatedly, even after `Renderer.update`: the gradients are always those of the
-        rendered model.  Raises ValueError for arrays of another shape, and for `depth` if the model moves; use a
+        rendered model.  Raises ValueError for arrays of the wrong shape, and for `depth` if the model moves; use a
         renderer of `model.at(time)` instead.
         """
         return self.renderer.backward(self, image, alpha, depth)

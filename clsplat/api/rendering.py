@@ -138,7 +138,7 @@ def camera_path(
 def write_video(file: PathLike, images: "Iterable[NDArray[np.generic]]", fps: float = 30) -> int:
     """Write images, [height, width, 3] in [0, 1] or uint8, as a .webm or .mp4 video.  Return the number of images.
 
-    Raises ConfigError for another suffix or an odd size, and ValueError for images of different sizes.
+    Raises ConfigError for any other suffix, or an odd width or height, and ValueError for images of different sizes.
     """
     from clsplat.viewer.video.encoding import write_video
 

@@ -134,7 +134,10 @@ def bench(
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Time the stages of a training step on fixed scenes, next to the measured peaks of the device."""
+    """Time the stages of a training step on fixed scenes.
+
+    The times are compared with the measured peak compute and memory throughput of the device.
+    """
     if as_json:
         terminal.keep_stdout_for_json()
     baseline = tools.read_measurement(against, pipeline) if against else {}

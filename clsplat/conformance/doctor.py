@@ -41,23 +41,27 @@ class Verdict:
         return "error" if not self.usable else "warning" if self.advice else "ready"
 
 
-def judge(default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]) -> Verdict:
-    """Return the verdict on a device from the results of each schedule, and of the checks that run `once` per device.
+def judge(
+    default: str, schedules: Mapping[str, Sequence[CheckResult]], device_results: Sequence[CheckResult]
+) -> Verdict:
+    """Return the verdict on a device from the results of each schedule, and of the checks that run once per device.
 
-    default: the schedule that the device uses by default.
+    default: the schedule that the device uses by default.  device_results: the results of the latter.
     """
-    verdict = _judge_failures(default, schedules, once)
-    if verdict.usable and any(result.damaged_cache for results in (*schedules.values(), once) for result in results):
+    verdict = _judge_failures(default, schedules, device_results)
+    if verdict.usable and any(
+        result.damaged_cache for results in (*schedules.values(), device_results) for result in results
+    ):
         advice = f"remove {kernel_caches()}, and try again" + (f"; {verdict.advice}" if verdict.advice else "")
         return Verdict(True, f"{verdict.text}; its cache of built kernels is damaged", advice)
     return verdict
 
 
 def _judge_failures(
-    default: str, schedules: Mapping[str, Sequence[CheckResult]], once: Sequence[CheckResult]
+    default: str, schedules: Mapping[str, Sequence[CheckResult]], device_results: Sequence[CheckResult]
 ) -> Verdict:
     failures = {name: [text for result in results for text in result.failures] for name, results in schedules.items()}
-    other_failures = [text for result in once for text in result.failures]
+    other_failures = [text for result in device_results for text in result.failures]
     passing_schedules = [name for name, texts in failures.items() if not texts]
     if passing_schedules and (default in passing_schedules or default not in failures):
         return _judge_default(failures, other_failures)
@@ -97,12 +101,12 @@ class DeviceReport:
     info: DeviceInfo
     default: str  # the default schedule
     schedules: dict[str, list[CheckResult]] = field(default_factory=dict)
-    once: list[CheckResult] = field(default_factory=list)  # memory and speed, only with the default schedule
+    device_results: list[CheckResult] = field(default_factory=list)  # memory and speed, only with the default schedule
     seconds: float = 0.0
 
     @property
     def verdict(self) -> Verdict:
-        return judge(self.default, self.schedules, self.once)
+        return judge(self.default, self.schedules, self.device_results)
 
     @property
     def usable(self) -> bool:
@@ -112,12 +116,12 @@ class DeviceReport:
     @property
     def failures(self) -> dict[str, list[str]]:
         """A sentence for each failure, by schedule; failures of memory and speed have the key ''."""
-        by_schedule = {**self.schedules, "": self.once}
+        by_schedule = {**self.schedules, "": self.device_results}
         return {name: [text for result in results for text in result.failures] for name, results in by_schedule.items()}
 
     def note(self, name: str) -> dict[str, Any] | None:
         """Return the data of the note named `name`, or None if no check reported it."""
-        for result in (*self.once, *self.schedules.get(self.default, [])):
+        for result in (*self.device_results, *self.schedules.get(self.default, [])):
             for note in result.notes:
                 if note.name == name:
                     return note.data
@@ -132,7 +136,7 @@ class DeviceReport:
             "device": {**asdict(self.info), "schedule": self.default},
             "host": describe_host(),
             "schedules": {name: [_to_plain(result) for result in results] for name, results in self.schedules.items()},
-            "once": [_to_plain(result) for result in self.once],
+            "once": [_to_plain(result) for result in self.device_results],
             "seconds": round(self.seconds, 1),
         }
 
@@ -222,7 +226,7 @@ def examine(device: str | Device | None = None) -> DeviceReport:
         else:
             forget(info, schedule)
     for result in run_checks(info, default, SPEED_CHECKS):
-        report.once.append(result)
+        report.device_results.append(result)
         LOG.info("%s", progress_line("", result))
     report.seconds = time.perf_counter() - start_time
     return report
@@ -272,7 +276,7 @@ def report_page(report: DeviceReport) -> str:
     """Return the report as an HTML page."""
     verdict = report.verdict
     sections = {f"The {name} schedule": results for name, results in report.schedules.items()}
-    sections |= {"Memory and speed": report.once}
+    sections |= {"Memory and speed": report.device_results}
     return render(
         "doctor.html.j2",
         title=f"Doctor: {report.info.name}",

@@ -57,7 +57,7 @@ def ensure_correct(device: Device, sort: Sort = "auto") -> None:
         if result.damaged_cache:
             raise DeviceError(f"{device.label}: {kernel_cache_advice()}")
         if not result.passes:
-            verdict = "cannot be trusted" if result.fault else "computes wrongly"
+            verdict = "cannot be trusted" if result.fault else "computes wrong results"
             raise DeviceError(f"{device.label} {verdict}: {result.failures[0]}; run `clsplat doctor` for details")
     remember(info, schedule, sorts)
 

@@ -70,9 +70,9 @@ def _set_children(edit: Edit, row_offset: Array) -> None:
     """Write the values that rules set for children, unless a later rule or limit changed the number of children."""
     copies, first_rows = edit.row_counts(), row_offset.get()
     for name, sources, values in edit.children:
-        is_complete = copies[sources] == values.shape[1]
-        rows = first_rows[sources[is_complete], None] + np.arange(values.shape[1])
-        edit.gaussians.set_rows(name, rows.ravel(), values[is_complete].reshape(-1, values.shape[2]))
+        keeps_count = copies[sources] == values.shape[1]
+        rows = first_rows[sources[keeps_count], None] + np.arange(values.shape[1])
+        edit.gaussians.set_rows(name, rows.ravel(), values[keeps_count].reshape(-1, values.shape[2]))
 
 
 Corner = Annotated[list[float | None], Field(min_length=3, max_length=3)]

@@ -46,7 +46,9 @@ def encode_outcomes(
     if mask.dtype != np.bool_ or mask.shape != (count,):
         raise ValueError(f"mask: expected bool [{count}], got {mask.dtype} {list(mask.shape)}")
     if not np.issubdtype(copies.dtype, np.integer) or copies.shape not in ((), (count,)):
-        raise ValueError(f"copies: expected an integer or integers [{count}], got {copies.dtype} {list(copies.shape)}")
+        raise ValueError(
+            f"copies: expected an integer, or integers of shape [{count}], got {copies.dtype} {list(copies.shape)}"
+        )
     require_rows(int(copies.min(initial=0)), old_rows)
     require_rows(int(copies.max(initial=0)), old_rows)
     return np.where(mask, copies.astype(np.int64) + 1, 0).astype(np.uint32)
@@ -190,7 +192,7 @@ class Edit:
 
         rows: distinct Gaussians, [n].  values: [n, copies, components], for `copies` rows per Gaussian; ignored for a
         Gaussian whose growth is undone later.
-        Raises ValueError for invalid rows (see `check_rows`) and for values of a wrong shape.
+        Raises ValueError for invalid rows (see `check_rows`) and for values of the wrong shape.
         """
         components = self.gaussians.tables[name].components
         if values.ndim != 3 or len(values) != len(rows) or values.shape[2] != components:

@@ -78,14 +78,14 @@ SCORES: dict[Score, ScoreFunction] = {"weight": contributions, "sensitivity": se
 Mask = NDArray[np.bool_]
 
 
-def sampling_order(candidates: Mask, weights: NDArray[np.float64], random: np.random.Generator) -> NDArray[np.intp]:
+def sampling_order(candidates: Mask, weights: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.intp]:
     """Return the indices of the candidates in the order of weighted sampling without replacement.
 
     candidates: mask, [N].  weights: [N], 0 to infinity.  The largest ln(U) / weight comes first (Efraimidis and
     Spirakis 2006).
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        keys = np.log1p(-random.random(len(weights))) / weights
+        keys = np.log1p(-rng.random(len(weights))) / weights
     indices = np.flatnonzero(candidates)
     return indices[np.argsort(-keys[indices], kind="stable")]
 

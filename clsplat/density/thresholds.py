@@ -23,7 +23,7 @@ class Quantile(Settings):
 
 
 class PixelQuantile(Settings):
-    """The quantile of the texture, per px, over the pixels of the training photographs."""
+    """A quantile of the texture over the pixels of the training photographs.  Its unit is 1 / px."""
 
     quantile: UnitInterval
     """Fraction of the pixels that are below the threshold."""

@@ -162,19 +162,19 @@ class Gltf:
         if WIDTHS.get(row["type"]) != width or "sparse" in row or "bufferView" not in row:
             raise DataError(
                 f"{self.path}: accessor {index} has type {quote(row['type'])}, is sparse, or has no data; "
-                f"expected {width} numbers per row in a buffer; export it again without compression"
+                f"expected {width} numbers per element in a buffer; export it again without compression"
             )
         size = width * np.dtype(dtype).itemsize
         data, offset, length, stride = self._buffer_view(row["bufferView"], size)
         if stride < size:
             raise DataError(
-                f"{self.path}: the rows of accessor {index} are {stride} bytes apart; expected at least {size}; "
+                f"{self.path}: the elements of accessor {index} are {stride} bytes apart; expected at least {size}; "
                 "export it again"
             )
         if start + stride * max(count - 1, 0) + size * min(count, 1) > length:
             raise DataError(
-                f"{self.path}: accessor {index} has {count} rows, more than fit into its view of {length} bytes; "
-                "copy or export it again"
+                f"{self.path}: accessor {index} has {count} elements, more than fit into its buffer view of {length} "
+                "bytes; copy or export it again"
             )
         self.bytes_left -= count * size
         if self.bytes_left < 0:

@@ -99,7 +99,7 @@ def encode_webp(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
 def decode_webp(path: Path, name: str, data: bytes, min_pixels: int, max_pixels: int) -> NDArray[np.uint8]:
     """Decode a WebP image to pixels, [n, 4] RGBA, row by row.
 
-    Raises DataError for another format, and, before decoding, if n is below `min_pixels` or above `max_pixels`.
+    Raises DataError for any other format, and, before decoding, if n is below `min_pixels` or above `max_pixels`.
     """
     width, height = webp_size(path, name, data)
     if not min_pixels <= width * height <= max_pixels:

@@ -178,7 +178,7 @@ def unique_points(points: NDArray[np.float32], max_points: int) -> tuple[NDArray
 
 
 def robust_max(values: NDArray[np.float32]) -> np.float32:
-    """Return the quantile 1 - TAIL of the absolute values, or 0 if there are no values."""
+    """Return the (1 - TAIL) quantile of the absolute values, or 0 if there are no values."""
     magnitudes = np.abs(values).ravel()
     index = min(int((1 - TAIL) * magnitudes.size), magnitudes.size - 1)
     return np.float32(np.partition(magnitudes, index)[index] if magnitudes.size else 0)

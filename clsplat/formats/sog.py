@@ -256,7 +256,7 @@ class _Sog:
         return WIDTHS[width // PER_ROW]
 
     def _decode(self, name: str, levels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Decode the bytes of a part, [N, c], which are codebook indices, or in version 1 fractions of a range."""
+        """Decode the bytes of a property, [N, c], which are codebook indices, or in version 1 fractions of a range."""
         if not self.is_version_1:
             entries = self._read_numbers(f"{name}.codebook", self._part(name).get("codebook"), 256)
             return np.asarray(entries.astype(np.float32)[levels])
@@ -268,7 +268,7 @@ class _Sog:
         return (minimum + levels / 255.0 * (maximum - minimum)).astype(np.float32)
 
     def _read_pixels(self, name: str, index: int) -> NDArray[np.uint8]:
-        """Return the pixels of an image of a part, one pixel per splat, [count, 4]."""
+        """Return the pixels of an image of a property, such as `means`, one pixel per splat, [count, 4]."""
         images = self.images[name]
         if index >= len(images):
             raise DataError(
@@ -286,7 +286,7 @@ class _Sog:
         return part
 
     def _read_files(self, name: str) -> list[bytes]:
-        """Return the contents of the files of a part.  Raises DataError for names outside the folder."""
+        """Return the contents of the files of a property.  Raises DataError for names outside the folder."""
         names = self._part(name).get("files")
         if not isinstance(names, list) or not 1 <= len(names) <= 2 or not all(isinstance(file, str) for file in names):
             raise DataError(
@@ -305,7 +305,7 @@ class _Sog:
         return minimum, maximum
 
     def _read_numbers(self, key_path: str, value: Any, count: int) -> NDArray[np.float64]:
-        """Return a list of at least `count` numbers as an array.  Raises DataError for another value."""
+        """Return a list of at least `count` numbers as an array.  Raises DataError for any other value."""
         is_list = isinstance(value, list) and count <= len(value) <= 256
         if not is_list or not all(isinstance(number, int | float) and abs(number) < MAX_NUMBER for number in value):
             raise DataError(
@@ -326,8 +326,8 @@ class _Sog:
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # maximum palette entries in training
 RELATIVE_PALETTES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # palette entries per splat, outside training
-MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of palette vectors, in levels of 1/128
-QUAT_STEP = 4  # of quaternions, in levels of 1/255
+MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of palette vectors, in units of 1/128
+QUAT_STEP = 4  # of quaternions, in units of 1/255
 SIZE_STEP = 0.25  # step of positions of median weight, relative to the Gaussian's size
 SCALE_STEP = 0.1  # of log scales
 COLOR_STEP = 0.05  # of coefficients of band 0; 1 changes a color by 0.28

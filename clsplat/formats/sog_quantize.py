@@ -176,8 +176,8 @@ def fit_tree_palette(
 ) -> tuple[NDArray[np.float64], Labels]:
     """Return at most `max_entries` palette vectors, [E, 3 K], for SH [N, 3 K], and the label of each Gaussian, [N].
 
-    log_weights: [N], from `log_weights`.  median_step: median rounding step of the vectors, in levels of
-    1 / SH_LEVELS, for coefficients of typical size.
+    log_weights: [N], from `log_weights`.  median_step: median rounding step of the vectors, in units of
+    1 / SH_LEVELS, for SH with an RMS of TYPICAL_RMS; it is scaled to the RMS of `rest`.
     """
     form, weights = visible_form(rest), np.exp2(log_weights)
     labels = _split_clusters(_to_euclidean(rest, form), weights, max_entries)

@@ -79,16 +79,16 @@ MAX_INT24 = 2**23 - 1
 FRACTION, FINE_FRACTION = 12, 20  # fractional bits of positions; the second for quality `high`
 COARSE, MAX_FRACTION = 2, 23  # models smaller than 2^-COARSE scene units get more bits; readers accept up to 23
 ROWS = 1 << 13  # rows decoded at once, to limit temporary memory
-# steps of SH coefficients, in levels of 256: the typical and the largest step for a Gaussian of median weight, and the
+# steps of SH coefficients, in units of 1/128: the typical and the largest step for a Gaussian of median weight, and the
 # largest step for any Gaussian
 MEDIAN_STEP = {"small": (7.5, 12.5), "balanced": (3.0, 5.0), "high": (1.0, 1.0)}
 MAX_STEP = {"small": 128.0, "balanced": 64.0, "high": 1.0}
 # step of positions for a Gaussian of median weight, relative to its smallest scale
 POSITION_STEP = {"small": 0.5, "balanced": 0.5, "high": 0.0}
-# steps of colors, in levels of 255: for a Gaussian of median weight, and the largest
+# steps of colors, in units of 1/255: for a Gaussian of median weight, and the largest
 BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
 MAX_ZEROS = 16  # last bits of a position that may be zeroed
-QUAT_STEP = {"small": 4, "balanced": 4, "high": 1}  # step of quaternions, in levels of 511
+QUAT_STEP = {"small": 4, "balanced": 4, "high": 1}  # step of quaternions, in units of 1/511
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def _encode_rotations(quats: NDArray[np.float32], step: int) -> bytes:
 
 
 def _sh_steps(rest: NDArray[np.float32], weights: NDArray[np.float64], options: WriteOptions) -> NDArray[np.float32]:
-    """Return the rounding step of each Gaussian's SH, [N], in levels of 1/128; all steps are 1 for quality `high`."""
+    """Return the rounding step of each Gaussian's SH, [N], in units of 1/128; all steps are 1 for quality `high`."""
     max_step = MAX_STEP[options.quality]
     if max_step == 1 or not rest.shape[1]:
         return np.ones(len(rest), np.float32)

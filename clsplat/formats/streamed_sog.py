@@ -107,7 +107,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
         )
     if (levels := meta.get("lodLevels")) != len(counts):
         raise DataError(
-            f"{path}: lodLevels is {quote(levels)}; expected {len(counts)}, the number of counts; export it again"
+            f"{path}: lodLevels is {quote(levels)}; expected {len(counts)}, the length of counts; export it again"
         )
     return meta
 

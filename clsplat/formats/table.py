@@ -247,11 +247,12 @@ def writing_format(path: Path) -> Codec:
 
 
 def write(path: Path, splats: SplatFile, options: WriteOptions | None = None) -> str:
-    """Write a model file in the format of its name; warn about losses unless `options.quiet`.
+    """Write a model file in the format that its name implies; warn about losses unless `options.quiet`.
 
     Returns the SHA-256 of the file; for a SOG folder, that of its meta.json.
-    Raises ConfigError for an unknown name, DataError for a model that the format cannot store, OutputError if the file
-    cannot be written, and ValueError for a world filter that is not baked, since only a PLY can store it.
+    Raises ConfigError if the name implies no format that can be written, DataError for a model that the format cannot
+    store, OutputError if the file cannot be written, and ValueError for a world filter that is not baked, since only a
+    PLY can store it.
     """
     codec = writing_format(path)
     assert codec.write is not None

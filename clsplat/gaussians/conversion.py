@@ -252,7 +252,7 @@ def writing_options(out: Path, quality: Quality, changes: Changes) -> WriteOptio
 def convert(
     sources: Sequence[Path], out: Path, changes: Changes | None = None, quality: Quality = "balanced"
 ) -> dict[str, Any]:
-    """Read model files or run folders and write all their Gaussians to one file, in the format of its name.
+    """Read model files or run folders and write all their Gaussians to one file, in the format that its name implies.
 
     Returns a dictionary with `file`, `format`, `gaussians`, `bytes`, and `bytes_read`.
     Raises ConfigError, DataError, OutputError.

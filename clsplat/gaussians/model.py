@@ -305,7 +305,7 @@ class Model:
         return replace(self, log_scales=log_scales, logit_opacity=logits, filter_variance=None)
 
     def save(self, path: str | Path, options: WriteOptions | None = None) -> str:
-        """Write a file in the format of its name: .ply, .spz, .sog, .glb, and others (docs/formats.md).
+        """Write a file in the format that its name implies: .ply, .spz, .sog, .glb, and others (docs/formats.md).
 
         A PLY stores a world filter as the property `filter_3D`; for other formats, it is baked.  A sky is written next
         to the model as NAME_sky.json, which contains the SHA-256 of the model file, so that no other model uses it.

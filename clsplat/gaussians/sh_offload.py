@@ -41,7 +41,7 @@ class HostTables:
 
     @property
     def block_size(self) -> int:
-        """The number of SH values in a slot."""
+        """The number of `sh_rest` values in a block."""
         return int(self.tables["sh_rest"].shape[1]) * self.lanes
 
     def add(self, name: str, components: int) -> Array:

@@ -151,7 +151,8 @@ def without_sky_path(model: Path) -> Path:
 def write_sky_file(sky: Sky | None, model: Path, digest: str) -> None:
     """Write a sky next to its model file; if `sky` is None, remove the model from the sky file.
 
-    digest: SHA-256 of the model file.  Other models with the same stem keep an identical sky.  Raises OutputError.
+    digest: SHA-256 of the model file.  If the sky in the file is identical, its entries for other models are kept.
+    Raises OutputError.
     """
     path = sky_path(model)
     try:

@@ -55,7 +55,7 @@ class Relocate(Rule):
         edit.choose(is_faint | (draws > 0), copies=np.where(is_faint, 0, draws + 1), old_rows=1)
 
 
-def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.random.Generator) -> NDArray[np.int64]:
+def sample_systematically(weights: NDArray[np.uint64], draws: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Return the number of times that systematic sampling draws each item, [N]: the expected number rounded down or up.
 
     With exact integer arithmetic, the function places `draws` equidistant points, shifted by one random number, on the
@@ -64,7 +64,7 @@ def sample_systematically(weights: NDArray[np.uint64], draws: int, random: np.ra
     ends = np.cumsum(weights)
     total = int(ends[-1])
     step, remainder = divmod(total, max(draws, 1))
-    index, start = np.arange(draws, dtype=np.uint64), np.uint64(random.integers(0, total))
+    index, start = np.arange(draws, dtype=np.uint64), np.uint64(rng.integers(0, total))
     points = index * np.uint64(step) + (index * np.uint64(remainder) + start) // np.uint64(max(draws, 1))
     return np.diff(np.searchsorted(points, ends, side="left"), prepend=0)
 

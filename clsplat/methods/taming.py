@@ -88,10 +88,10 @@ class GrowScored(ScoredRule):
         if not is_undone.any():
             return
         room = edit.room + int(np.maximum(rows - 1, 0).sum())
-        score, random = self.score(edit), edit.random()
+        score, rng = self.score(edit), edit.random()
         # first the clones, with their part of the room, and then the splits, with the remainder
         for group, fraction in ((is_clone, (is_undone & is_clone).sum() / is_undone.sum()), (~is_clone, 1.0)):
-            order = sampling_order((rows > 1) & group, score, random)
+            order = sampling_order((rows > 1) & group, score, rng)
             added_rows = np.cumsum(rows[order] - 1)
             is_affordable = added_rows <= round(fraction * room)
             is_undone[order[is_affordable]] = False

@@ -210,7 +210,7 @@ class FieldPlan:
 
     @property
     def total_bytes(self) -> int:
-        """The sum of all parts."""
+        """The required memory in total, with TABLE_COUNT tables of parameters."""
         return TABLE_COUNT * self.parameters + self.features + self.partials + self.photographs
 
     def text(self, limits: DeviceLimits) -> str:

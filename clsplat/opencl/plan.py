@@ -73,7 +73,7 @@ class Plan:
                 if argument.is_pointer != isinstance(value, Array) or (
                     argument.is_pointer and argument.dtype not in (None, value.dtype)
                 ):
-                    raise KernelError(f"{launch.source.label}: {name} is a {type(value).__name__} of another type")
+                    raise KernelError(f"{launch.source.label}: {name} is a {type(value).__name__} of the wrong type")
                 if argument.is_pointer:
                     launch.arguments[index] = weakref.ref(value.buffer)
                     launch.kernel.set_arg(index, value.buffer)

@@ -136,7 +136,7 @@ class Photographs:
         self._cache[key] = photograph
         return photograph
 
-    def get_unmasked(self, view: View, original: View, index: int | None = None) -> Photograph:
+    def get_nonempty(self, view: View, original: View, index: int | None = None) -> Photograph:
         """Return the photograph of a view, or of the larger view `original` if the mask excludes all pixels of `view`.
 
         index: the index of the view, see DeviceCamera.  Raises DataError if the mask excludes all of `original` too.

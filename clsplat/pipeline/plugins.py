@@ -154,7 +154,7 @@ def _collect_classes(module: str, path: Path | None = None) -> Iterator[list[typ
     ConfigError.  Every exception except KeyboardInterrupt is converted.
     """
     classes: list[type] = []
-    lists = _class_lists()  # complete for this package, so that new classes belong to the plug-in
+    lists = _class_lists()  # they already contain all classes of clsplat, so new ones belong to the plug-in
     old_lists, modules = [list(registered) for registered in lists], set(sys.modules)
     try:
         with redirect_stdout(sys.stderr):  # stdout is for results

@@ -64,7 +64,7 @@ def run_words(values: NDArray[np.void], width: int, height: int, side: int) -> I
 
 
 class Skies:
-    """Renders skies and computes their gradients; caches the runs of recent cameras."""
+    """Renders skies and computes their gradients; caches the pixel runs of recently used cameras."""
 
     def __init__(self, device: Device, workspace: Workspace, cache_size: int = CACHE_SIZE) -> None:
         self.device, self.workspace = device, workspace

@@ -91,7 +91,7 @@ class TooManyPairs(Exception):
 
 
 def resolve_sort(device: Device, sort: Sort) -> Sort:
-    """Resolve `auto` to radix on devices without barriers, which bitonic needs; return other sorts unchanged."""
+    """Resolve `auto` to radix on devices without barriers, which bitonic needs; otherwise, return `sort`."""
     return "radix" if sort == "auto" and int(device.tuning["TEAM"]) == 1 else sort
 
 

@@ -14,10 +14,10 @@ LOG = logging.getLogger("clsplat")
 class Failures(dict[str, ClsplatError]):
     """A dictionary from the name of each failed part to its error."""
 
-    def __init__(self, parts: str) -> None:
-        """parts: a plural noun for messages, such as "cells"."""
+    def __init__(self, plural: str) -> None:
+        """plural: the noun for the parts in messages, such as "cells"."""
         super().__init__()
-        self._parts = parts
+        self._plural = plural
 
     @contextmanager
     def recording(self, name: str) -> Iterator[None]:
@@ -41,7 +41,7 @@ class Failures(dict[str, ClsplatError]):
     def summary(self, count: int, verb: str = "failed") -> ClsplatError:
         """Return a single error with the exit code of the first failure.  count: total number of parts."""
         name, first_error = next(iter(self.items()))
-        error = ClsplatError(f"{len(self)} of {count} {self._parts} {verb}; the first, {name}: {first_error}")
+        error = ClsplatError(f"{len(self)} of {count} {self._plural} {verb}; the first, {name}: {first_error}")
         error.exit_code = first_error.exit_code
         return error
 

@@ -153,7 +153,7 @@ def _missing_model_error(folder: Path, name: str = MODEL) -> DataError:
     fault = f"{folder}: has no {PIPELINE}; expected a model file or a run folder"
     if any(map(is_image, chain(folder.glob("*"), folder.glob("images/*")))):
         return DataError(
-            f"{fault}; to train a model of its photos, run `clsplat run photos --scene {shell_quote(folder)}` first"
+            f"{fault}; to train a model on its photos, run `clsplat run photos --scene {shell_quote(folder)}` first"
         )
     return DataError(fault)
 

@@ -90,7 +90,9 @@ def make_video(
     if target.file_format not in FORMATS:
         raise ConfigError(f"--format: expected {' or '.join(FORMATS)}, got '{target.file_format}'")
     if videos and target.file_format != FORMATS[0]:
-        raise ConfigError(f"--format {target.file_format} is for images, and a video has 8 bits; omit --video")
+        raise ConfigError(
+            f"--format {target.file_format} applies only to images, since videos have 8 bits per channel; omit --video"
+        )
     if extras.side and not videos:
         raise ConfigError("--side needs --video, because images are written without a comparison; add --video FILE")
     content = _read(model)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, quote
 
 MAX_SIDE = 4096 * 8  # px: tiles per side that cl_kernels/tiles.h can index, times the smallest tile size
-MAX_SOURCE = 32764  # px: OpenCV cannot remap larger photographs
+MAX_PHOTO_SIDE = 32764  # px: OpenCV cannot remap larger photographs
 MIN_FOCAL = 1e-3  # px, in a dataset: a shorter one would cover nearly half of all directions
 
 
@@ -278,10 +278,10 @@ class Lens:
         focal = max(self._intrinsics[:2])
         side = 2 * math.ceil(FACE_TANGENT * focal)
         long_side = max(self.width, self.height)
-        if side > MAX_GROWTH * long_side or long_side > MAX_SOURCE:
+        if side > MAX_GROWTH * long_side or long_side > MAX_PHOTO_SIDE:
             raise DataError(
                 f"the {self.model} camera is {self.width}x{self.height} with focal lengths {self._intrinsics[:2]}; "
-                f"expected at most {MAX_SOURCE} px per side and focal lengths up to "
+                f"expected at most {MAX_PHOTO_SIDE} px per side and focal lengths up to "
                 f"{MAX_GROWTH / 2 / FACE_TANGENT:.2g} times the long side: calibrate the camera again"
             )
         if not self._visible_grid.any():

@@ -21,9 +21,10 @@ PRECEDENCE = (MulticameraReader, ColmapReader, BlenderReader, MultiscaleReader, 
 
 
 def readers() -> list[Reader]:
-    """Return the readers in order of precedence: shipped readers, then readers of plug-ins in order of definition.
+    """Return the readers in order of precedence.
 
-    Raises ConfigError if two readers have the same name.
+    Each shipped reader is followed by its subclasses in plug-ins; the other readers of plug-ins are last, in order of
+    definition.  Raises ConfigError if two readers have the same name.
     """
 
     def rank(reader_type: type[Reader]) -> int:

@@ -255,7 +255,10 @@ def _stem(name: str) -> str:
 
 
 def _keys(parts: PathParts) -> set[str]:
-    """Return the possible stems of the file for a name, such as `a.jpg.png`, `a.jpg` and `a` for `a.jpg.png`."""
+    """Return the keys of a file name for lookups: the name, and the name without one or two suffixes.
+
+    For example, `a.jpg.png` has the keys `a.jpg.png`, `a.jpg`, and `a`.
+    """
     return {parts[-1], _stem(parts[-1]), _stem(_stem(parts[-1]))} if parts else set()
 
 

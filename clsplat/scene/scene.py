@@ -122,7 +122,7 @@ class Scene:
         return make_scene(IN_MEMORY, list(views), test_indices, points, background)
 
     def split(self, name: str) -> tuple[View, ...]:
-        """Return the views of `train`, `test`, `validation` or `all`.  Raises ValueError for another name."""
+        """Return the views of `train`, `test`, `validation` or `all`.  Raises ValueError for any other name."""
         if name == "all":
             return self.views
         if name not in SPLITS:

@@ -180,7 +180,7 @@ def _with_png(name: str) -> list[str]:
 
 
 def list_frames(parts: Parts, root: Path, *names: str) -> None:
-    """Add the frames of the existing files among `names` and the points of the first file to `parts`."""
+    """Add to `parts` the frames of those files in `names` that exist, and the points of the first one."""
     files = [parts.attempt(Transforms, parts.path / name) for name in names if (parts.path / name).is_file()]
     timestamps = [time for file in filter(None, files) for time in parts.attempt(file.timestamps) or []]
     clock = parts.attempt(make_clock, parts.path, timestamps)

@@ -183,7 +183,7 @@ class View:
 
 
 def _validate_pixels(name: str, image: ArrayLike) -> NDArray[Any]:
-    """Return an image as uint8 or uint16, [height, width, 3 or 4].  Raises DataError for another shape or range."""
+    """Return an image as uint8 or uint16, [height, width, 3 or 4].  Raises DataError for any other shape or range."""
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or not pixels.size:
         raise DataError(f"the image of {quote(name)} has shape {pixels.shape}; expected (height, width, 3 or 4)")

@@ -405,7 +405,7 @@ class Optimize(ValidatedTraining):
         """Return the losses and gradients of a view, and the names of the parameters not to update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
-        photograph = run.photographs.get_unmasked(sample.view, sample.original, sample.index)
+        photograph = run.photographs.get_nonempty(sample.view, sample.original, sample.index)
         offsets = range(1, min(READ_AHEAD, self.steps - run.stage_step) + 1)
         run.photographs.prefetch(sampler.at(run.step + offset).view for offset in offsets)
         frozen = {name for stage in self.during if stage.is_due(run.step) for name in stage.frozen_parameters(run)}

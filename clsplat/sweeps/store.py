@@ -377,8 +377,8 @@ class CellFolder:
         if result["bits"] != manifest["bits"]:
             raise BitsMismatch(
                 f"{self.path}: the same cell gave different bits on two devices of one bits class: {self.result} on "
-                f"{result.get('device')}, {attempt.path} on {manifest.get('device')}; one of them computes wrongly: "
-                "`clsplat doctor` shows which"
+                f"{result.get('device')}, {attempt.path} on {manifest.get('device')}; one of them computes wrong "
+                "results: `clsplat doctor` shows which"
             )
         return result
 

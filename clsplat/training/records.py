@@ -94,13 +94,13 @@ class Records:
     @contextmanager
     def stage(self) -> Iterator[None]:
         """When the block ends, write the lines that it added; if it fails, drop them."""
-        lines, pending = self.line_count, len(self._pending)
+        old_line_count, old_pending_count = self.line_count, len(self._pending)
         try:
             yield
             self.write()
         except BaseException:
-            del self._pending[pending:]
-            self.line_count = lines
+            del self._pending[old_pending_count:]
+            self.line_count = old_line_count
             raise
 
     def read(self, kind: str | None = None, trial: bool = False) -> list[dict[str, Any]]:

@@ -51,7 +51,7 @@ class AlignOptions:
 
 @dataclass(frozen=True)
 class AlignInput:
-    """The scene, the model, or both, that are aligned.  Their coordinates are relative to the same origin."""
+    """The scene to align, the model to align, or both.  Their coordinates are relative to the same origin."""
 
     path: Path
     scene: Scene | None = None

@@ -199,7 +199,7 @@ def test_run_folder_without_model_is_explained(finished, tmp_path):
     (tmp_path / "a.JPG").touch()
     for command in ("evaluate", "view"):
         said = clsplat(command, tmp_path, expect=3).stderr
-        assert f"to train a model of its photos, run `clsplat run photos --scene {tmp_path}` first" in said
+        assert f"to train a model on its photos, run `clsplat run photos --scene {tmp_path}` first" in said
     run = tmp_path / "run"
     shutil.copytree(finished, run)
     text = (run / "pipeline.yaml").read_text()

@@ -66,7 +66,7 @@ def test_doctor_deletes_the_record_of_a_faulty_device(monkeypatch, info, empty_c
     quick.ensure_correct(device)
     worker(monkeypatch, "0.3")
     examine(device)
-    with pytest.raises(DeviceError, match="computes wrongly"):
+    with pytest.raises(DeviceError, match="computes wrong results"):
         quick.ensure_correct(device)
 
 
@@ -112,7 +112,9 @@ def test_faulty_device_is_refused(monkeypatch, info, empty_cache):
     worker(monkeypatch, "0.3")
     device = Device(info)
     for _ in range(2):  # it is not remembered
-        with pytest.raises(DeviceError, match=r"computes wrongly: blend_backward differs by 0.3 .*clsplat doctor"):
+        with pytest.raises(
+            DeviceError, match=r"computes wrong results: blend_backward differs by 0.3 .*clsplat doctor"
+        ):
             quick.ensure_correct(device)
 
 
@@ -204,7 +206,7 @@ def test_faulty_device_writes_no_render_and_no_model(
 ):
     worker(monkeypatch, "0.3")
     device = {"default": None, "name": info.name, "open": Device(info)}[given]
-    with pytest.raises(DeviceError, match=r"computes wrongly: blend_backward differs by 0.3 .*clsplat doctor"):
+    with pytest.raises(DeviceError, match=r"computes wrong results: blend_backward differs by 0.3 .*clsplat doctor"):
         WORK[work](tiny_scene, model, tmp_path / "out", device)
     assert not list((tmp_path / "out").rglob("*"))
 

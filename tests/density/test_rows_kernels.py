@@ -92,7 +92,7 @@ WRONG_CHOICES = {
     ),
     "short copies": (
         (np.ones(COUNT, bool), np.ones(3, int), 0),
-        r"copies: expected an integer or integers \[150\], got int64 \[3\]",
+        r"copies: expected an integer, or integers of shape \[150\], got int64 \[3\]",
     ),
     "copies with a fraction": ((np.ones(COUNT, bool), 1.5, 0), "copies: expected an integer or .*, got float64"),
     "copies beyond 32 bits": (

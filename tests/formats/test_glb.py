@@ -154,11 +154,17 @@ def change(place, value):
 
 
 REFUSED = {
-    "count": (change(["accessors", 0, "count"], 10**9), "has 1000000000 rows, more than fit into its view of 48 bytes"),
+    "count": (
+        change(["accessors", 0, "count"], 10**9),
+        "has 1000000000 elements, more than fit into its buffer view of 48 bytes",
+    ),
     "counts": (change(["accessors", 0, "count"], 3), "different counts"),
     "stride": (change(["bufferViews", 0, "byteStride"], 4), "are 4 bytes apart; expected at least 12"),
     "no stride": (change(["bufferViews", 0, "byteStride"], 0), "are 0 bytes apart; expected at least 12"),
-    "short view": (change(["bufferViews", 0, "byteLength"], 1), "has 4 rows, more than fit into its view of 1 bytes"),
+    "short view": (
+        change(["bufferViews", 0, "byteLength"], 1),
+        "has 4 elements, more than fit into its buffer view of 1 bytes",
+    ),
     "long view": (change(["bufferViews", 0, "byteLength"], 10**9), "at 0, more than its buffer of [0-9]+ bytes"),
     "length of a view": (
         change(["bufferViews", 0, "byteLength"], "a"),

@@ -255,7 +255,7 @@ WRONG = {
     ),
     "too few names": ({"filenames": []}, "refers to a missing file of level 0"),
     "no counts": ({"counts": []}, "expected a number for each of 1 to 64 levels"),
-    "more levels than are declared": ({"lodLevels": 2}, "lodLevels is 2; expected 3, the number of counts"),
+    "more levels than are declared": ({"lodLevels": 2}, "lodLevels is 2; expected 3, the length of counts"),
     "more levels than there can be": (
         {"counts": [0] * 65, "lodLevels": 65},
         "expected a number for each of 1 to 64 levels",

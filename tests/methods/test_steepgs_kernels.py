@@ -57,7 +57,7 @@ def uncapped_case(rng, opacity=(0.1, 0.7)) -> tuple[Case, ref.Splats, np.ndarray
     drawn = rng.uniform(*opacity, (6, 1))
     case.parameters["logit_opacity"][:] = np.log(drawn / (1 - drawn))
     splats, weights = case.project(ref.SMOOTH_THRESHOLDS), rng.normal(size=(3, 20, 24))
-    return case, splats, weights, ref.screen_splitting(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH_THRESHOLDS)
+    return case, splats, weights, ref.splitting_matrices(splats, 24, 20, BACKGROUND, weights, ref.SMOOTH_THRESHOLDS)
 
 
 def test_mean_of_two_shifts_changes_the_loss_by_the_matrix(rng):
@@ -111,8 +111,8 @@ def test_scene_matrix_holds_where_perspective_is_constant(rng, far, bound):
         return ref.project(own, camera, 0, thresholds=ref.SMOOTH_THRESHOLDS)
 
     still = projected(np.zeros(3))
-    on_screen = ref.screen_splitting(still, 24, 20, BACKGROUND, weights, ref.SMOOTH_THRESHOLDS)
-    matrices, alpha = ref.splitting(scene, camera, on_screen), alphas(still, 24, 20)
+    on_screen = ref.splitting_matrices(still, 24, 20, BACKGROUND, weights, ref.SMOOTH_THRESHOLDS)
+    matrices, alpha = ref.scene_splitting_matrices(scene, camera, on_screen), alphas(still, 24, 20)
     before, step = loss_of(alpha, still, weights), 2e-3
     for n in range(6):
         v = rng.normal(size=3)
@@ -149,8 +149,8 @@ def test_column_matches_the_reference_matrix(device, rng, count):
     case = safe_case(rng, count, 33, 31, change=lambda p: p["means"].__setitem__(slice(2, None, 7), [0, 0, -9]))
     weights = rng.normal(size=(3, 31, 33)).astype(np.float32)
     actual, stats = added_up(device, case, weights, views=2)
-    on_screen = ref.screen_splitting(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
-    expected = ref.splitting(case.gaussians(), case.camera(), on_screen)
+    on_screen = ref.splitting_matrices(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
+    expected = ref.scene_splitting_matrices(case.gaussians(), case.camera(), on_screen)
     assert relative_error(actual, 2 * expected[:, *np.triu_indices(3)]) < GRADIENT
     assert (actual[2::7] == 0).all()
     np.testing.assert_allclose(stats.means("splitting"), np.where(stats.means("screen_grad") > 0, actual / 2, 0))

@@ -73,11 +73,11 @@ def test_changes_have_the_type_and_the_value_of_the_launch(device):
         plans.run("part", {"word": 2}, part, 1)
     for _ in range(2):
         run(plans, part, 1)
-    with pytest.raises(KernelError, match="fill_words: values is a Array of another type"):
+    with pytest.raises(KernelError, match="fill_words: values is a Array of the wrong type"):
         run(plans, part, 1, device.zeros(16, np.float32))
     with pytest.raises(KernelError, match=r"the plan expects values of word, values; got word$"):
         plans.run("part", {"word": 1}, part, 1)
-    with pytest.raises(KernelError, match="fill_words: word is a Array of another type"):
+    with pytest.raises(KernelError, match="fill_words: word is a Array of the wrong type"):
         plans.run("part", {"word": part.target, "values": part.target}, part, 1)
 
 

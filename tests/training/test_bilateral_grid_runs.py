@@ -224,7 +224,7 @@ def test_damaged_tables_are_refused():
         with pytest.raises(DataError, match=r"its grids do not have|of its BilateralGrid has"):
             BilateralGrid.check_saved(rows, damaged)
     for damage in ({"colors/b/row": 6.0}, {"colors/a/row": 0.5}, {"colors/c/row": 2.0}):
-        with pytest.raises(DataError, match="color grids for 2 photos"):
+        with pytest.raises(DataError, match="bilateral grids for 2 photos"):
             BilateralGrid.check_saved(rows | damage, good)
 
 

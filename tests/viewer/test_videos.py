@@ -244,7 +244,7 @@ def test_invalid_command_ends_in_one_line(options, message, few_steps, tmp_path)
         ({"fps": float("nan")}, "expected frames per second"),
         ({"video": None, "side": "photograph"}, "--side needs --video"),
         ({"format": "gif", "video": None}, "expected png or npy, got 'gif'"),
-        ({"format": "npy"}, "--format npy is for images"),
+        ({"format": "npy"}, "--format npy applies only to images"),
         ({"side": "no.ply"}, "no.ply"),
     ],
 )

@@ -1,1 +1,1 @@
-"""Measure the time of training steps, and compare it with the peaks of the device."""
+"""Measure the time of training steps, and compare it with the device's peak throughput."""

@@ -1,4 +1,4 @@
-"""Run a benchmark, and compare its times with the device's peaks and with an earlier measurement."""
+"""Run a benchmark, and compare its times with the device's peak throughput and an earlier measurement."""
 
 import textwrap
 from collections.abc import Sequence

@@ -92,8 +92,10 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
         comparison = Comparison(rasterizer.workspace, camera, frame.image, frame.image, frame.image)
         for _ in range(2):
             stats.add(ViewGradients(frame, comparison, [], pixel_sums), pixel_sums)
-        screen_matrices = ref.screen_splitting(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
-        expected = 2 * ref.splitting(case.gaussians(), case.camera(), screen_matrices)[:, *np.triu_indices(3)]
+        screen_matrices = ref.splitting_matrices(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
+        expected = (
+            2 * ref.scene_splitting_matrices(case.gaussians(), case.camera(), screen_matrices)[:, *np.triu_indices(3)]
+        )
         actual = model.gaussians.get("stats/splitting")
         yield compare("accumulate_splitting", f"matrices of {count} Gaussians", actual, expected, GRADIENT)
 

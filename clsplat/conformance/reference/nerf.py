@@ -214,7 +214,7 @@ class HashLevel:
         return np.sqrt(-np.expm1(-4 / np.pi / (8 * variances * self.cells**2)))
 
     def corners(self, positions: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Return the entries of the corners around positions in the cube, and their weights, both [S, 8]."""
+        """Return the table indices of the corners around positions in the cube, and their weights, both [S, 8]."""
         cell = np.clip(np.floor(positions * self.cells), 0, self.cells - 1)
         fraction = positions * self.cells - cell
         sides = cell[:, None].astype(np.int64) + CORNERS
@@ -237,7 +237,7 @@ class HashLevel:
         return grad_table
 
     def _masked_corners(self, positions: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Return the entries of the corners around samples, and their weights, 0 outside of the cube, both [S, 8]."""
+        """Return what `corners` returns, with weights of 0 for samples outside of the cube."""
         is_inside = np.all((positions >= 0) & (positions <= 1), axis=1)
         entries, weights = self.corners(np.where(is_inside[..., None], positions, 0.5))
         return entries, weights * (is_inside * self.weights(variances))[:, None]

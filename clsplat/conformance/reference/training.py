@@ -37,14 +37,16 @@ def adam_step(
     return np.where(rows, new_parameter, parameter), np.where(rows, first, moment1), np.where(rows, second, moment2)
 
 
-# Penalties on scales and opacities, with their gradients with respect to log_scales and logit_opacity.
+# Penalties on scales and opacities.  Gradients are with respect to log_scales and logit_opacity.
 
 
 def covariance_trace(
     log_scales: NDArray[Any], threshold: NDArray[Any] | float, extent: float
 ) -> tuple[float, NDArray[Any]]:
-    """Return the mean of max(sum of squared scales - threshold, 0) / extent².  log_scales: [N, 3]; threshold: scene
-    units²."""
+    """Return the mean of max(sum of squared scales - threshold, 0) / extent², and its gradient.
+
+    log_scales: [N, 3]; threshold: scene units².
+    """
     scale2 = np.exp(2 * log_scales)
     excess = scale2.sum(axis=1) - threshold
     is_above = (excess > 0)[:, None]
@@ -52,7 +54,7 @@ def covariance_trace(
 
 
 def anisotropy(log_scales: NDArray[Any], threshold: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of max(longest / shortest axis - threshold, 0).  log_scales: [N, 3]."""
+    """Return the mean of max(longest / shortest axis - threshold, 0), and its gradient.  log_scales: [N, 3]."""
     rows = np.arange(len(log_scales))
     longest, shortest = log_scales.argmax(axis=1), log_scales.argmin(axis=1)
     ratio = np.exp(log_scales[rows, longest] - log_scales[rows, shortest])
@@ -64,26 +66,26 @@ def anisotropy(log_scales: NDArray[Any], threshold: float) -> tuple[float, NDArr
 
 
 def mean_scale(log_scales: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of scales / extent.  log_scales: [N, 3]."""
+    """Return the mean of scales / extent, and its gradient.  log_scales: [N, 3]."""
     scales = np.exp(log_scales)
     return scales.mean() / extent, scales / scales.size / extent
 
 
 def min_scale(log_scales: NDArray[Any], extent: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of the smallest scales / extent.  log_scales: [N, 3]."""
+    """Return the mean of the smallest scales / extent, and its gradient.  log_scales: [N, 3]."""
     smallest = np.exp(log_scales.min(axis=1, keepdims=True))
     is_smallest = log_scales == log_scales.min(axis=1, keepdims=True)
     return smallest.mean() / extent, smallest * is_smallest / len(log_scales) / extent
 
 
 def mean_opacity(logit_opacity: NDArray[Any]) -> tuple[float, NDArray[Any]]:
-    """Return the mean of the opacities.  logit_opacity: [N, 1]."""
+    """Return the mean of the opacities, and its gradient.  logit_opacity: [N, 1]."""
     opacities = 1 / (1 + np.exp(-logit_opacity))
     return opacities.mean(), opacities * (1 - opacities) / opacities.size
 
 
 def opacity_pressure(logit_opacity: NDArray[Any], floor: float) -> tuple[float, NDArray[Any]]:
-    """Return the mean of max(logit - floor, 0).  logit_opacity: [N, 1]."""
+    """Return the mean of max(logit - floor, 0), and its gradient.  logit_opacity: [N, 1]."""
     excess = np.maximum(logit_opacity - floor, 0)
     return excess.mean(), (excess > 0) / excess.size
 
@@ -179,7 +181,7 @@ def reset_logit(logit: NDArray[Any], filter_ratio: NDArray[Any] | float = 1.0, l
 # The splitting matrix (SteepGS, Wang et al. 2025): the change of the loss if a splat is split in two.
 
 
-def screen_splitting(
+def splitting_matrices(
     splats: Splats,
     width: int,
     height: int,
@@ -206,7 +208,9 @@ def mean_jacobian(camera: PinholeCamera, mean: NDArray[Any]) -> NDArray[Any]:
     return perspective @ camera.rotation
 
 
-def splitting(gaussians: RawGaussians, camera: PinholeCamera, screen_matrices: NDArray[Any]) -> NDArray[Any]:
+def scene_splitting_matrices(
+    gaussians: RawGaussians, camera: PinholeCamera, screen_matrices: NDArray[Any]
+) -> NDArray[Any]:
     """Convert matrices on the screen, [N, 2, 2], to matrices in the scene, [N, 3, 3], for constant splat shapes."""
     matrices = np.zeros((len(screen_matrices), 3, 3))
     for n in np.flatnonzero(screen_matrices.any(axis=(1, 2))):

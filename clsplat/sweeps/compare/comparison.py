@@ -109,7 +109,7 @@ class VariantRow:
         return set.intersection(*downscale_sets)
 
     def values(self, split: str, downscale: str, metric: str) -> list[float]:
-        """Return the value of a metric for each run; empty if a run does not have it."""
+        """Return the value of a metric for each run, or an empty list if any run lacks it."""
         averages = [getattr(run.metrics, split).get(downscale) for run in self.runs]
         values = [average.value(metric) if average else None for average in averages]
         available_values = [value for value in values if value is not None]

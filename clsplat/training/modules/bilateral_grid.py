@@ -61,7 +61,7 @@ class BilateralGrid(Appearance):
     """Weight of the total variation loss of the step's grid: the mean squared difference of adjacent nodes, summed over
     the axes."""
 
-    side_files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors", VIEW_GRIDS: "color grids"}
+    side_files: ClassVar[Mapping[str, str]] = {VIEW_COLORS: "colors", VIEW_GRIDS: "bilateral grids"}
     device_planes: ClassVar[int] = 9  # including the gradient before clipping at white
 
     def create_state(self, run: Run) -> "GridState":
@@ -82,7 +82,7 @@ class BilateralGrid(Appearance):
         rows, count = sorted(row for key, row in scalars.items() if key.endswith("/row")), len(tables["values"])
         if rows != list(range(count)):
             raise DataError(
-                f"it has color grids for {count} photos, but their rows are not numbered from 0 to {count - 1}"
+                f"it has bilateral grids for {count} photos, but their rows are not numbered from 0 to {count - 1}"
             )
 
     def rate_schedule(self, steps: int, photographs: int, is_warm_start: bool = True) -> Schedule:
