@@ -88,7 +88,7 @@ POSITION_STEP = {"small": 0.5, "balanced": 0.5, "high": 0.0}
 # steps of colors, in units of 1/255: for a Gaussian of median weight, and the largest
 BASE_STEP = {"small": (2**0.5, 16.0), "balanced": (2**0.5, 16.0), "high": (1.0, 1.0)}
 MAX_ZEROS = 16  # last bits of a position that may be zeroed
-QUAT_STEP = {"small": 4, "balanced": 4, "high": 1}  # step of quaternions, in units of 1/511
+QUAT_STEP = {"small": 4, "balanced": 4, "high": 1}  # step of quaternions, in units of sqrt(1/2) / 511
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def _list_entries(path: Path) -> list[Path]:
 
 
 def _find_camera_names(path: Path) -> set[str]:
-    """Return the possible camera names of a dataset, or an empty set if a file is damaged, which another reader reports."""
+    """Return the possible camera names of a dataset, or an empty set if a file is damaged (other readers report it)."""
     try:
         if (path / TRANSFORMS).is_file():
             paths = [frame.value("file_path") for frame in Transforms(path / TRANSFORMS).frames]
