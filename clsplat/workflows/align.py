@@ -235,6 +235,8 @@ def align(
     if not is_model:
         if inputs.scene is None:
             raise ConfigError(f"{out}: is the name of a folder, and {path} is a model; use a name that ends in .ply")
+        if out.resolve() in (path.resolve(), inputs.scene.path.resolve()):
+            raise ConfigError(f"{out}: is the input; use another folder")
         alignment = Alignment.solve(inputs, options)
         files = write_cameras(alignment.transform.transform_scene(inputs.scene), out, format_, images)
         return {**alignment.data(), "files": [str(file) for file in files]}

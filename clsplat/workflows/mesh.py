@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.core.errors import ConfigError, DataError, MemoryLimitError, shell_quote
-from clsplat.core.files import check_not_run_file
 from clsplat.core.machine import available_memory
 from clsplat.core.progress import counted
 from clsplat.formats.mesh import WRITERS, Mesh
+from clsplat.gaussians.conversion import check_output
 from clsplat.render.fusion import (
     MAX_PIXEL,
     MIN_VIEWS,
@@ -132,7 +132,7 @@ def write_mesh(
     options = options or MeshOptions()
     if (write := WRITERS.get(out.suffix.lower())) is None:
         raise ConfigError(f"{out}: expected a name that ends in {', '.join(WRITERS)}")
-    check_not_run_file(out)
+    check_output([model], out)
     photo_model = ModelFile(model, scene, device, downscale)
     if is_moving(photo_model.gaussians):
         command = f"`clsplat convert {shell_quote(model)} OUT.ply --time T`"

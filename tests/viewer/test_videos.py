@@ -273,14 +273,16 @@ def test_model_without_a_scene_is_rendered_from_outside(few_steps, tmp_path):
         clsplat.render_path(model, out=tmp_path / "c", path="fixed", position=(0, 0), **options)
 
 
-def test_camera_is_where_it_was_requested(few_steps, tiny_scene):
+@pytest.mark.parametrize("target", [(0.5, 0.0, 0.0), (1.0, 0.0, 3.0), (1.0, 2.0, -1.0)])
+def test_camera_is_where_it_was_requested(few_steps, tiny_scene, target):
+    """Also straight down or up."""
     scene, points = clsplat.read_scene(tiny_scene), clsplat.load(few_steps).means
-    options = {"position": (1.0, 2.0, 3.0), "target": (0.5, 0.0, 0.0)}
+    options = {"position": (1.0, 2.0, 3.0), "target": target}
     for used_scene in (scene, None):
         plan = plan_video(VideoRequest.parse("fixed", 2, None, "64x48", **options), used_scene, points)
         assert len(plan.views) == 2
         for view in plan.views:
             np.testing.assert_allclose(view.position, (1, 2, 3), atol=1e-9)
-            x, y, z = view.world_to_camera @ (0.5, 0, 0, 1)
+            x, y, z = view.world_to_camera @ (*target, 1)
             np.testing.assert_allclose([x, y], 0, atol=1e-9)
             assert z > 0

@@ -242,3 +242,12 @@ def test_bad_input_is_refused(scene, tmp_path, text, options, expected):
         clsplat.align(scene, tmp_path / "out", **options)
     assert expected in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_scene_is_not_written_into_itself(scene, tmp_path):
+    files = sorted(scene.rglob("*"))
+    (tmp_path / "link").symlink_to(scene)
+    for out in (scene, tmp_path / "link"):
+        with pytest.raises(ClsplatError, match="is the input"):
+            clsplat.align(scene, out, level="cameras", format="nerfstudio")
+    assert sorted(scene.rglob("*")) == files

@@ -190,8 +190,10 @@ def test_invalid_input_is_refused(few_steps, tiny_scene, tmp_path, monkeypatch):
         clsplat.write_mesh(few_steps, tmp_path / "a.ply", keep=0.5)
     with pytest.raises(ConfigError, match=r"expected a name that ends in .ply, .obj, .glb"):
         clsplat.write_mesh(few_steps, tmp_path / "a.stl")
-    with pytest.raises(ConfigError, match="is a file of a run"):
+    with pytest.raises(ConfigError, match="is one of the input files"):
         clsplat.write_mesh(few_steps, few_steps / "point_cloud.ply")
+    with pytest.raises(ConfigError, match="is a file of a run"):
+        clsplat.write_mesh(tmp_path / "other.ply", few_steps / "point_cloud.ply", tiny_scene)
     faint = clsplat.load(few_steps)
     faint.logit_opacity[:] = -10
     faint.save(tmp_path / "faint.ply")

@@ -207,7 +207,10 @@ def _plan_path(request: VideoRequest, scene: Scene | None, points: Floats, origi
     if request.position is not None:
         offset = np.zeros(3) if origin is None else origin
         target = rig.focus if request.target is None else request.target - offset
-        views = look_at_targets(request.position - offset[None], target[None], rig.up[None], rig, size)
+        forward, up = target - (request.position - offset), rig.up
+        if np.linalg.norm(np.cross(forward, up)) <= 1e-9 * np.linalg.norm(forward):  # straight down or up
+            up = np.eye(3)[2 - np.abs(up[::-1]).argmin()]
+        views = look_at_targets(request.position - offset[None], target[None], up[None], rig, size)
         return VideoPlan(repeat_view(views[0], request.frames or FRAMES, size), request.fps or FPS)
     if scene is None and request.path == "fixed":
         return VideoPlan(repeat_view(rig.views[0], request.frames or FRAMES, size), request.fps or FPS)
