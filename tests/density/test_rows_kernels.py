@@ -94,7 +94,7 @@ WRONG_CHOICES = {
         (np.ones(COUNT, bool), np.ones(3, int), 0),
         r"copies: expected an integer, or integers of shape \[150\], got int64 \[3\]",
     ),
-    "copies with a fraction": ((np.ones(COUNT, bool), 1.5, 0), "copies: expected an integer or .*, got float64"),
+    "copies with a fraction": ((np.ones(COUNT, bool), 1.5, 0), r"copies: expected an integer, or .*, got float64"),
     "copies beyond 32 bits": (
         (np.arange(COUNT) == 7, np.full(COUNT, 2**32), 0),
         "copies: expected a row count of at most 4294967294, got 4294967296",
