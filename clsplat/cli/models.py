@@ -147,7 +147,7 @@ FramesOption = Annotated[
     "convert",
     "clsplat convert point_cloud.ply scene.spz",
     "clsplat convert moving.ply frames --frames 30",
-    "clsplat convert scene.ply scene.usdz --collider hull.ply",
+    "clsplat convert scene.ply scene.usdz --collider collider.ply",
     "clsplat convert a.ply b.sog both.glb --transform 'rotate=90,0,0'",
 )
 def convert(
@@ -353,7 +353,7 @@ ScaleOption = Annotated[
     "mesh",
     "clsplat mesh runs/splat_7k scene.glb",
     "clsplat mesh point_cloud.ply a.ply --scene my_scene --voxel 0.02",
-    "clsplat mesh runs/splat_7k hull.obj --collision --keep 0.1",
+    "clsplat mesh runs/splat_7k collider.obj --collision --keep 0.1",
 )
 def mesh(
     model: ModelArgument,
@@ -365,7 +365,7 @@ def mesh(
     ] = None,
     keep: Annotated[float, typer.Option(metavar="F", help="Fraction of the faces to keep.")] = 1.0,
     collision: Annotated[
-        bool, typer.Option("--collision", help="Write a closed hull of all space that no two views see as free.")
+        bool, typer.Option("--collision", help="Write a closed collision mesh around all space that fewer than two views see as free.")
     ] = False,
     scale: ScaleOption = None,
     device: DeviceOption = None,

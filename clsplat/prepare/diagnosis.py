@@ -114,7 +114,7 @@ def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str,
     for name in sorted(set(graph.features) - main_model):
         model = next((model for model in models[1:] if name in model), None)
         reasons[name] = (
-            f"in another model, with {first_few(sorted(model - {name}))}"
+            f"in a separate reconstruction, with {first_few(sorted(model - {name}))}"
             if model
             else _explain(graph, name, main_model, typical_sharpness)
         )
@@ -132,7 +132,7 @@ def _explain(graph: MatchGraph, name: str, placed_names: set[str], typical_sharp
         return f"matches no other photo{note}"
     best = max(matches, key=lambda other: (matches[other], other))
     if not counts:
-        return f"matches only {best}, which is not placed either"
+        return f"matches only {best}, which is not registered either"
     if max(counts.values()) < FEW_MATCHES:
         return f"few matches, at most {max(counts.values())}, with {max(counts, key=lambda o: (counts[o], o))}{note}"
     return "blurred" if is_blurry else f"{matches[best]} matches with {best}, but too few on points of the model"

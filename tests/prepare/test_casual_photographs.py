@@ -219,14 +219,14 @@ def test_each_unregistered_photograph_has_a_reason(tmp_path):
         "elsewhere": "matches no other photo; it may be blurred",
         "plain": "only 40 features: blurred, dark, or a plain surface",
         "alone": "matches no other photo",
-        "pair": "matches only other, which is not placed either",
-        "other": "matches only pair, which is not placed either",
+        "pair": "matches only other, which is not registered either",
+        "other": "matches only pair, which is not registered either",
         "few": "few matches, at most 18, with a",
         "many": "80 matches with a, but too few on points of the model",
     }
     assert (
         explain_unplaced(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"]
-        == "in another model, with other"
+        == "in a separate reconstruction, with other"
     )
     figures = {"registered": 3, "not_registered": ["plain"], "reasons": result, "other_models": [2]}
     missing, others = warnings_for(figures)
