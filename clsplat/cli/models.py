@@ -365,7 +365,7 @@ def mesh(
     ] = None,
     keep: Annotated[float, typer.Option(metavar="F", help="Fraction of the faces to keep.")] = 1.0,
     collision: Annotated[
-        bool, typer.Option("--collision", help="Write a closed collision mesh around all space that fewer than two views see as free.")
+        bool, typer.Option("--collision", help="Write a closed collision mesh around all space not seen as free.")
     ] = False,
     scale: ScaleOption = None,
     device: DeviceOption = None,
