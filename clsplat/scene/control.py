@@ -63,6 +63,9 @@ class MarkedPoint:
         """
         views = [find_view(scene, mark.photo) for mark in self.marks]
         pixels = np.array([mark.pixel for mark in self.marks])
+        sizes = [(photo.width, photo.height) for photo in (view.lens or view.camera for view in views)]
+        for i in np.flatnonzero(((pixels < 0) | (pixels > sizes)).any(axis=1)):
+            raise DataError(f"point {quote(self.name)}: its mark in {self.marks[i].photo} is not in the photo; fix it")
         if len(views) == 1:
             return self._find_nearest_point(scene, views[0], pixels)
         rays = [_ray(view, pixel) for view, pixel in zip(views, pixels, strict=True)]
