@@ -164,6 +164,7 @@ def reduce(mesh: Mesh, keep: float) -> Mesh:
         return mesh
     import fast_simplification  # optional
 
+    keep = max(keep, 4 / len(mesh.faces))  # a tetrahedron is the smallest closed surface
     points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, 1 - keep)
     points = np.asarray(points, np.float64)
     colors = mesh.colors[cKDTree(mesh.vertices).query(points)[1]]
