@@ -14,7 +14,7 @@ from clsplat.plugin import TrainingStep, ViewTable, Workspace, at_step
 
 KERNEL, FILE = Path(__file__).with_suffix(".cl"), "view_responses.json"
 CURVES = [f"{channel}_{node}" for channel in ("red", "green", "blue") for node in (0, 1, 3, 4)]
-AREAS = np.array([0.5, 1, 1, 1, 0.5]) / 4  # contribution of a slope of 1 at each node to f(1)
+NODE_AREAS = np.array([0.5, 1, 1, 1, 0.5]) / 4  # contribution of a slope of 1 at each node to f(1)
 TABLE = ViewTable("responses", (), ("center_x", "center_y", "a", "b", "c", *CURVES), is_centered=False)
 
 
@@ -100,14 +100,14 @@ def with_rows(scene: Scene, rows: Mapping[str, Floats]) -> Scene:
 def curve_slopes(row: Floats) -> Floats:
     """Compute the slopes of the three curves at their nodes, [3, 5], from a camera's parameters, [17]."""
     slopes = np.exp(np.insert(row[5:].reshape(3, 4), 2, 0, axis=1))
-    return np.asarray(slopes / (slopes @ AREAS)[:, None])
+    return np.asarray(slopes / (slopes @ NODE_AREAS)[:, None])
 
 
 def row_gradient(row: Floats, sums: Floats) -> Floats:
     """Compute the gradient of a camera's parameters, [17], from sums over pixel rows, [20, rows]."""
     totals, slopes = np.cumsum(sums, axis=1, dtype=np.float64)[:, -1], curve_slopes(row)
     grad_logs = slopes * totals[5:].reshape(3, 5)
-    grad_logs -= slopes * AREAS * grad_logs.sum(axis=1, keepdims=True)
+    grad_logs -= slopes * NODE_AREAS * grad_logs.sum(axis=1, keepdims=True)
     return np.concatenate([totals[:5], np.delete(grad_logs, 2, axis=1).ravel()])
 
 

@@ -34,6 +34,8 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/core/lock.py:_open_lock_file": "opens for writing too",
     "clsplat/formats/sog.py:open_sog": "takes the bytes that `reading` has read",
     "clsplat/formats/sog.py:_zip": "writes",
+    "clsplat/formats/usd.py:_read_layer": "takes the bytes that `reading` has read",
+    "clsplat/formats/usd.py:write_usd": "writes",
     "clsplat/viewer/video/encoding.py:open_video": "syncs what it has written",
     "clsplat/viewer/video/encoding.py:count_frames": "decodes what was written before",
     "clsplat/viewer/video/encoding.py:fix_track_ids": "changes what was written before",
@@ -46,7 +48,7 @@ ALLOWED = {  # module and function -> why it reads by itself
     "clsplat/core/machine.py:available_memory": "reads what the kernel tells, which has no size",
     "data_tools/video.py:decode_frames": "decodes what was hashed before",
     "data_tools/lpips.py:write_lpips": "unpacks a package whose hash was checked",
-    "data_tools/fetch.py:_members": "unpacks what it has downloaded",
+    "data_tools/fetch.py:_open_members": "unpacks what it has downloaded",
 }
 
 

@@ -41,7 +41,7 @@ WORDS = {
 }
 KINDS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
 NAMES = {"compressed PLY": "a.compressed.ply", "SPZ": "a.spz", "SOG": "a.sog", "GLB": "a.glb", "splat": "a.splat"}
-NAMES |= {"glTF": "a.gltf"}
+NAMES |= {"glTF": "a.gltf", "OpenUSD": "a.usda"}
 AXES = struct.pack("<2I4s2II", 7, 4, b"abcd", 0xADBE0003, 4, 12)  # records of an SPZ file
 
 

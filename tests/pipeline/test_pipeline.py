@@ -357,7 +357,7 @@ REFUSED = {
     "quoted number": (replaced("steps: 10", "steps: '10'"), "expected a whole number, got '10'"),
     "fraction for a whole": (replaced("steps: 10", "steps: 10.5"), "expected a whole number, got 10.5"),
     "negative": (replaced("steps: 10", "steps: -1"), "greater than 0, got -1"),
-    "infinite": (replaced("weight: 0.8", "weight: .inf"), "finite"),
+    "infinite": (replaced("weight: 0.8", "weight: .inf"), "expected a number, .*got inf"),
     "a number to reach without an end": (
         replaced("every: 100\n", "every: 100\n            budget: {type: parabola, gaussians: 10}\n"),
         r"'budget' needs 'stop'",

@@ -225,7 +225,7 @@ def test_incomplete_database_is_rebuilt(five, tmp_path):
         shutil.copy(five / name, tmp_path / "half" / "images")
     database = str(tmp_path / "half" / "database.db")
     pycolmap.Database.open(database).close()
-    pycolmap.import_images(database, str(five), read_image_names=first)
+    pycolmap.import_images(database, str(five), image_names=first)
     find_features(five, tmp_path / "half", FeatureOptions(320, 500))
     assert rows(tmp_path / "half" / "database.db") == rows(tmp_path / "whole" / "database.db")
 

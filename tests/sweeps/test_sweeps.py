@@ -404,7 +404,7 @@ def test_local_engine_runs_cells_in_parallel_on_loopback(tmp_path, monkeypatch):
     monkeypatch.setattr(scheduler, "find_slots", lambda worker, devices, packing: slots)
     store, ended, seen = Store(tmp_path / "store"), [], set()
     before = {key: library.dask.config.get(key) for key in library.SETTINGS}
-    cluster = scheduler.engine(Execution(engine="local"), store, None)
+    cluster = scheduler.open_engine(Execution(engine="local"), store, None)
     try:
         cluster.make_command = lambda device: command(WRITES + f"; print({device!r})")
         cells = [PendingCell(CellRun(f"cell {i}", {**SPEC, "scene": str(i)}, ""), i) for i in range(4)]
