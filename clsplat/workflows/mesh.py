@@ -145,21 +145,23 @@ def write_mesh(
     voxel = options.voxel or VOXEL * pixel
     blocks = find_blocks(source.images("views searched", voxel), voxel, TRUNCATION * voxel)
     if not len(blocks):
-        raise _disagreement(model)
+        raise _disagreement(model, voxel, VOXEL * pixel if options.voxel else None)
     if options.collision:
         mesh, voxel = _hull(source, blocks, voxel, options.voxel)
     else:
         mesh = _surface(source, blocks, voxel)
     if not len(mesh.faces):
-        raise _disagreement(model)
+        raise _disagreement(model, voxel, VOXEL * pixel if options.voxel else None)
     mesh = reduce(mesh, options.keep)
     write(out, mesh, np.asarray(photo_model.scene.origin, np.float64))
     counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     return {"file": str(out), "bytes": out.stat().st_size, **counts, "voxel": voxel, "closed": mesh.is_closed}
 
 
-def _disagreement(model: Path) -> DataError:
-    return DataError(f"{model}: no two views agree on a surface; use a larger --voxel, or check --scene")
+def _disagreement(model: Path, voxel: float, default: float | None) -> DataError:
+    """Return the error for an empty mesh.  default: its voxel without --voxel, scene units; None: it was used."""
+    advice = f"omit --voxel, which uses {default:.3g}" if default else "check --scene"
+    return DataError(f"{model}: no two views agree on a surface with a voxel of {voxel:.3g} scene units; {advice}")
 
 
 def _surface(source: DepthSource, blocks: Blocks, voxel: float) -> Mesh:
