@@ -12,7 +12,7 @@ import json
 import logging
 import re
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -35,15 +35,14 @@ from clsplat.formats.splats import (
     Parameters,
     SplatFile,
     WriteOptions,
-    concatenate,
     flip_axes,
+    join_parts,
     normalize_quats,
     opacities,
     opacities_to_logits,
     require_gaussians,
     require_memory,
     scales_to_logs,
-    transform,
 )
 from clsplat.formats.spz import MAX_RATIO, MIN_LIMIT, decode_spz
 
@@ -57,7 +56,6 @@ SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|textur
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_READS = 8  # largest average number of reads of a byte; equal columns may share an accessor
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
-FLIP_4 = np.diag([*FLIP, 1.0])  # converts between the axes of glTF and of a PLY
 LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # signs that convert the axes of a PLY
 MAX_NAME = 500  # characters of a file name, and of a data URI before its data
 MAX_TEXT = 1 << 29  # bytes of a .gltf
@@ -270,29 +268,6 @@ class Gltf:
             return list(roots)
         nodes = self.tree["nodes"]
         return sorted(set(range(len(nodes))) - {child for node in nodes for child in node.get("children", [])})
-
-
-def join_parts(
-    path: Path, parts: Iterable[tuple[Parameters, NDArray[np.float64]]]
-) -> tuple[Parameters, NDArray[np.float64] | None]:
-    """Return the Gaussians of all parts relative to the first, and the placement of the first, None for the identity.
-
-    parts: Gaussians in the axes of a PLY, and a matrix, [4, 4], in axes with y up and z back.  Raises DataError.
-    """
-    first, joined = None, []
-    for part, matrix in parts:
-        first = matrix if first is None else first
-        if not np.allclose(matrix, first, rtol=1e-7):
-            relative = FLIP_4 @ np.linalg.inv(first) @ matrix @ FLIP_4
-            scale = float(np.cbrt(np.linalg.det(relative[:3, :3])))
-            try:
-                tables = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
-            except ValueError as error:
-                raise DataError(f"{path}: the transform of a node is not supported: {error}") from error
-            part = part | {name: table.astype(np.float32) for name, table in tables.items()}
-        joined.append(part)
-    placement = np.eye(4) if first is None else FLIP_4 @ first @ FLIP_4
-    return concatenate(joined), None if np.allclose(placement, np.eye(4)) else placement
 
 
 def _extensions(primitive: dict[str, Any]) -> dict[str, Any]:

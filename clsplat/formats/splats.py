@@ -10,7 +10,7 @@ Axes are those of a 3DGS PLY: x right, y down, z forward.
 
 import logging
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from pathlib import Path
@@ -93,6 +93,7 @@ FLATNESS = -6.907755  # log 1e-3: largest ratio of that axis to the others
 # axes in which the functions of bands 1 to 3 are odd
 PARITY = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 FLIP = (1.0, -1.0, -1.0)  # between y down, z forward, and y up, z back
+FLIP_4 = np.diag([*FLIP, 1.0])  # converts matrices [4, 4] likewise
 Quality = Literal["small", "balanced", "high"]  # precision of SPZ and SOG
 Parameters = dict[str, NDArray[np.float32]]  # by the names in PARAMETERS, each [N, components]
 Floats = NDArray[np.floating]
@@ -239,6 +240,29 @@ def transform(
         "log_scales": parameters["log_scales"] + np.log(scale),
         "sh_rest": rotate_sh(parameters["sh_rest"], rotation),
     }
+
+
+def join_parts(
+    path: Path, parts: Iterable[tuple[Parameters, NDArray[np.float64]]]
+) -> tuple[Parameters, NDArray[np.float64] | None]:
+    """Return the Gaussians of all parts relative to the first, and the placement of the first, None for the identity.
+
+    parts: Gaussians in the axes of a PLY, and a matrix, [4, 4], in axes with y up and z back.  Raises DataError.
+    """
+    first, joined = None, []
+    for part, matrix in parts:
+        first = matrix if first is None else first
+        if not np.allclose(matrix, first, rtol=1e-7):
+            relative = FLIP_4 @ np.linalg.inv(first) @ matrix @ FLIP_4
+            scale = float(np.cbrt(np.linalg.det(relative[:3, :3])))
+            try:
+                tables = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
+            except ValueError as error:
+                raise DataError(f"{path}: the transform of a node is not supported: {error}") from error
+            part = part | {name: table.astype(np.float32) for name, table in tables.items()}
+        joined.append(part)
+    placement = np.eye(4) if first is None else FLIP_4 @ first @ FLIP_4
+    return concatenate(joined), None if np.allclose(placement, np.eye(4)) else placement
 
 
 def reorder_columns(table: NDArray[np.float32], outer: int, inner: int) -> NDArray[np.float32]:

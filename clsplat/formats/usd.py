@@ -5,6 +5,7 @@ A mesh for collisions is a guide, which is not rendered, with the schema Physics
 """
 
 import io
+import logging
 import re
 import struct
 import warnings
@@ -19,7 +20,6 @@ from numpy.typing import NDArray
 from clsplat.core.errors import DataError, one_line, quote
 from clsplat.core.quaternions import rotation_matrix
 from clsplat.core.reading import read_file
-from clsplat.formats.gltf import LOG, join_parts
 from clsplat.formats.packing import EPOCH, HashedFile, open_hashed, write_bytes
 from clsplat.formats.splats import (
     FLIP,
@@ -30,6 +30,7 @@ from clsplat.formats.splats import (
     WriteOptions,
     columns_to_sh_degree,
     flip_axes,
+    join_parts,
     normalize_quats,
     opacities,
     opacities_to_logits,
@@ -38,6 +39,8 @@ from clsplat.formats.splats import (
     sh_coefficients,
     warn_dropped,
 )
+
+LOG = logging.getLogger("clsplat")
 
 # Writing.
 

@@ -20,7 +20,7 @@ from tests.targets.compilers import CompileError
 from tests.targets.figures import Figures, Place
 
 ROOT = Path(__file__).parents[2]
-QUICK = ["adam.cl", "blend_simt.cl", "loss.cl", "project.cl", "sort_bitonic.cl", "ssim.cl"]  # those that ask for most
+QUICK = ["adam.cl", "blend_simt.cl", "loss.cl", "project.cl", "sort_bitonic.cl", "ssim.cl"]  # the most demanding
 HEAD = "__kernel __attribute__((reqd_work_group_size({group}, 1, 1)))\nvoid planted("
 SPILLING = (
     HEAD.format(group=64)

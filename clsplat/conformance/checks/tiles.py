@@ -93,7 +93,7 @@ def radix_sort(device: Device, rng: np.random.Generator) -> Results:
 
 @CHECKS.add("find_tile_offsets")
 def many_tiles(device: Device, rng: np.random.Generator) -> Results:
-    """Check the offsets of so many tiles that no schedule sorts by tile in one pass."""
+    """Check the offsets of more tiles than any schedule sorts in one pass."""
     tiles = 5000
     pair_tile = rng.integers(0, tiles, 3000).astype(np.uint32)
     inputs = device.upload(pair_tile), device.upload(np.array([2900], np.uint32)), len(pair_tile), tiles
