@@ -120,20 +120,27 @@ class Correspondences:
         return transform, is_outlier
 
     def _require_determined(self, transform: Similarity, is_inlier: NDArray[np.bool_]) -> None:
-        """Raise DataError if the points are nearly on a line or too close together, compared with their errors."""
-        points = self.source[is_inlier] - self.source[is_inlier].mean(axis=0)
+        """Raise DataError if the points contradict each other, or are nearly on a line compared with their errors."""
+        points = transform.scale * (self.source[is_inlier] - self.source[is_inlier].mean(axis=0))
+        error = float(np.sqrt((self.distances(transform)[is_inlier] ** 2).mean()))
+        size = float(np.linalg.norm(points) / np.sqrt(len(points)))
         if self.up is not None:
             points = points - np.outer(points @ self.up, self.up)
         spreads = np.linalg.svd(points, compute_uv=False) / np.sqrt(len(points))
-        spread = float(spreads[1 if self.up is None else 0])
-        error = float(np.sqrt((self.distances(transform)[is_inlier] ** 2).mean()))
-        if not transform.scale > 0 or spread * transform.scale <= max(error, MIN_SPREAD * spreads[0]):
-            shape = "nearly on a line" if self.up is None else "above each other"
-            remedy = "add --level, or points away from that line" if self.up is None else "add points at other places"
+        if spreads[1 if self.up is None else 0] > max(error, MIN_SPREAD * spreads[0]) and transform.scale > 0:
+            return
+        if error > size / 2:
+            values = "coordinates" if self.scale is None else "coordinates and --distance"
             raise DataError(
-                f"the points are {shape}, up to their errors of {error:.3g}, so they do not determine the rotation; "
-                f"{remedy}"
+                f"errors of {error:.3g} remain, and the points are only {size:.3g} from their center; "
+                f"check their {values}"
             )
+        shape = "nearly on a line" if self.up is None else "above each other"
+        remedy = "add --level, or points away from that line" if self.up is None else "add points at other places"
+        raise DataError(
+            f"the points are {shape}, up to their errors of {error:.3g}, so they do not determine the rotation; "
+            f"{remedy}"
+        )
 
 
 ROUNDING = 1e-6  # of the spread of the targets: smaller distances are rounding errors

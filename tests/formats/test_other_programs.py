@@ -1,5 +1,7 @@
 """Points, tables, and pages for programs without Gaussians, opened by other programs' readers."""
 
+import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,6 +79,30 @@ def test_page_is_that_of_view(model, tmp_path):
     for options in ({"quality": "small"}, {"frames": 3}):
         with pytest.raises(ConfigError, match=r"c\.html: no format has the name 'c\.html'; use a name that ends in"):
             clsplat.convert(tmp_path / "a.ply", tmp_path / "c.html", **options)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".spz", ".sog", ".splat"])
+def test_model_is_read_by_splat_transform(suffix, model, tmp_path):
+    """A program of PlayCanvas, `npm install --global @playcanvas/splat-transform`, reads the values that we read."""
+    if not (program := shutil.which("splat-transform")):
+        pytest.skip("needs the command splat-transform, of npm")
+    file, out = tmp_path / f"b{suffix}", tmp_path / "c.csv"
+    replace(model, origin=np.zeros(3)).save(file)
+    subprocess.run([program, "--quiet", file, out], check=True, timeout=60)
+    table, expected = np.genfromtxt(out, delimiter=",", names=True), clsplat.load(file)
+
+    def columns(name: str, count: int) -> np.ndarray:
+        return np.stack([table[f"{name}_{i}"] for i in range(count)], axis=1)
+
+    np.testing.assert_allclose(np.stack([table[axis] for axis in "xyz"], axis=1), expected.means, atol=1e-6)
+    np.testing.assert_allclose(np.exp(columns("scale", 3)), expected.scales, rtol=1e-5)
+    np.testing.assert_allclose(1 / (1 + np.exp(-table["opacity"])), expected.opacities, atol=1e-6)
+    np.testing.assert_allclose(columns("f_dc", 3), expected.sh_base, atol=1e-6)
+    dots = (normalize_quats(columns("rot", 4)) * normalize_quats(expected.quats)).sum(axis=1)
+    np.testing.assert_allclose(np.abs(dots), 1, atol=1e-4)
+    if suffix != ".splat":  # has no harmonics
+        rest = columns("f_rest", 9).reshape(-1, 3, 3).transpose(0, 2, 1)
+        np.testing.assert_allclose(rest.reshape(-1, 9), expected.sh_rest, atol=1e-6)
 
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)

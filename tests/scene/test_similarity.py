@@ -49,12 +49,24 @@ def test_known_up_and_scale_are_kept(rng):
     known, source = known_transform(rng), rng.normal(size=(9, 3)) * [5, 0.001, 0.001]  # on a line
     up = known.rotation.T @ [0, 0, 1]
     target = known.apply(source) + rng.normal(0, 0.01, (9, 3))
-    with pytest.raises(DataError, match="nearly on a line"):
-        Correspondences(source, target).fit_inliers()
+    for shrink in (1, 1e-4):  # of the known coordinates, such as millimeters to meters
+        with pytest.raises(DataError, match="nearly on a line"):
+            Correspondences(source, shrink * target).fit_inliers()
     actual, _ = Correspondences(source, target, known.scale, up).fit_inliers()
     np.testing.assert_allclose(actual.rotation @ up, [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(actual.rotation, known.rotation, atol=0.01)
     assert actual.scale == known.scale
+
+
+def test_contradictory_points_are_reported(rng):
+    """The message blames the coordinates, and a distance if there is one, not the positions of the points."""
+    known, source = known_transform(rng), rng.normal(size=(6, 3))
+    target = known.apply(source)
+    Correspondences(source, 1e-4 * target).fit_inliers()
+    with pytest.raises(DataError, match=r"errors of .* remain.*check their coordinates and --distance"):
+        Correspondences(source, target, 0.01 * known.scale).fit_inliers()
+    with pytest.raises(DataError, match=r"errors of .* remain.*check their coordinates$"):
+        Correspondences(source[:4], rng.permutation(target)[:4] * [1, -1, 1]).fit_inliers()
 
 
 @pytest.mark.parametrize("end", [UP, -UP, np.array([0.6, 0.0, 0.8])])
