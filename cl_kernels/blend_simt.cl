@@ -45,8 +45,8 @@ static inline row_splat_t splat_on_line(const float *splat, const float row, con
 #define SPLAT_AT(splat, row, pixel) splat_at_row(splat, row)
 #endif
 
-/* The number of a bucket of a tile whose pairs start at `first`: no two buckets behind the first one of a tile share
- * it.  Bucket n contains, or is followed by, the pair n * BUCKET, which is of the same tile. */
+/* The number of the bucket that starts at pair `begin`, in a tile whose pairs start at `first`.  Later buckets of all
+ * tiles have different numbers: pair n * BUCKET is in the tile of bucket n, at the bucket's start or shortly before. */
 static inline size_t bucket_of(const uint first, const uint begin) { return first / BUCKET + (begin - first) / BUCKET; }
 
 static inline void store_state(__global float *state, const pixels_t *p)
@@ -158,8 +158,8 @@ static inline void write_sums(__global float *pair_sums, const uint pair, const 
         record[k] = vload4(k, sums);
 }
 
-/* Find the first and the end of the pairs of a bucket, and the end of those that a pixel may blend; bucket 0 is the
- * first one of each tile.  There are none if the tile does not have the bucket. */
+/* Find the first pair of a bucket, the end of its pairs, and the end of the pairs that a pixel may blend.  Bucket 0 is
+ * the first bucket of each tile.  There are no pairs if the tile does not have the bucket. */
 static inline void find_pairs(__global const uint *offset, const uint tile_last, const uint bucket, uint *first,
                               uint *last, uint *end)
 {
@@ -171,8 +171,8 @@ static inline void find_pairs(__global const uint *offset, const uint tile_last,
         *last = *end = *first;
 }
 
-/* One work-group = the first BUCKET pairs of a tile, or a later bucket, whose pixels start from the stored states: the
- * longest list does not delay the kernel.  Group end_tile + n - 1 takes bucket n, if it exists.
+/* One work-group = the first BUCKET pairs of a tile, or a later bucket, whose pixels start from the stored states, so
+ * that the longest list does not delay the kernel.  Group end_tile + n - 1 takes bucket n, if it exists.
  *
  * One item owns one splat of a batch of PIXELS and adds up the tile's pixels one after another: at step s, item i
  * computes pixel s - i, which item i - 1 computed in the previous step, so that every pixel blends its splats front to

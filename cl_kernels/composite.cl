@@ -14,7 +14,7 @@
 #define COLOR_PADDING 0.001f  // lets colors reach 0 and 1
 #define FLUSH_BELOW 1.0e-30f
 #define COLOR_ROWS 4          // rows of the network's colors, and of its densities: one block (layers.h)
-#define RAY_LENGTH 7           // of a ray's values: |d| (rays.cl)
+#define RAY_LENGTH 7           // index of |d| in a ray's values (rays.cl)
 #define RAY_STEP 8
 
 /* Replace numbers that are nearly subnormal, which are slow on some CPUs, with zero; NaN does not change. */

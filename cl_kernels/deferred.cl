@@ -2,8 +2,8 @@
  *
  * A Gaussian that a view does not show has a gradient of zero, so that its update depends only on its own value and
  * moments.  These updates are applied later, in order, each with its own factors, and give the same bits as immediate
- * updates.  A block of LANES Gaussians is updated together; `done` counts how many updates of the list `factors` the
- * block has had, in which each update is (rate, correction2) as in adam.h.
+ * updates.  A block of LANES Gaussians is updated together; `done` counts the updates of the list `factors` that the
+ * block has had.  Each update in the list is (rate, correction2), as in adam.h.
  *
  * One item = a block of LANES Gaussians.  No local memory.  Deterministic: each value has one writer. */
 #include "adam.h"

@@ -263,7 +263,7 @@ void share_opacity(
     logit_opacity[i] = x + log(-expm1(-x));
 }
 
-/* Lower opacities to the limit, which holds for the opacity after the world filter (the opacity reset of 3DGS and
+/* Lower opacities to the limit, which applies to the opacity after the world filter (the opacity reset of 3DGS and
  * Mip-Splatting). */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void cap_opacity(

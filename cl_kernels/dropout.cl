@@ -4,7 +4,7 @@
  * One item = one Gaussian.  No local memory.  The random numbers depend only on (seed, step, Gaussian). */
 #include "random.h"
 
-/* Decide at random whether each Gaussian is left out. */
+/* Mark the Gaussians that are left out: at random, or because the view hides them. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void draw_left_out(
     __global const float *restrict hidden,  // [planes,S] integers: bits of the views that hide a Gaussian

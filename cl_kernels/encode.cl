@@ -1,9 +1,9 @@
 /* The inputs of a network for one sample: the integrated positional encoding of its conical frustum, and the encoding
  * of its viewing direction (Barron et al. 2021).
  *
- * A frustum is a normal distribution (frustum.h), and its features are the means of sin(2^l x) and cos(2^l x), which
- * are those of the mean times exp(-4^l variance / 2) (equations 13 and 14).  Angles are in turns, so that their
- * integer part can be removed exactly.
+ * A frustum is a normal distribution (frustum.h), and its features are the means of sin(2^l x) and cos(2^l x): the
+ * sine and cosine of the mean, times exp(-4^l variance / 2) (equations 13 and 14).  Angles are in turns, so that
+ * their integer part can be removed exactly.
  *
  * Features: sines of x, y, z for l = 0, 1, ...; then cosines; then zeros up to a multiple of BLOCK (layers.h).
  * One item = LANES samples of one ray.  No local memory. */
@@ -74,7 +74,7 @@ void encode_frustums(
         VSTORE((VF)(0.0f), features + at + row * SAMPLES);
 }
 
-/* Direction of the ray, and its sines and cosines (released code: the direction itself too). */
+/* The direction of the ray, as in the released code, and its sines and cosines. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void encode_directions(
     __global const float *restrict cones,  // [rays,RAY_VALUES_READ]

@@ -2,8 +2,8 @@
  *
  * Grid points have the coordinates `voxel` times their integer index.  They are in blocks of BLOCK_SIDE^3, of which
  * only those near surfaces exist; the last axis of a block varies fastest.  A view at a point with depth z, whose pixel
- * has the depth d, measures the signed distance d - z, positive in front of the surface.  Points more than the
- * truncation behind the surface are hidden, and points more than that in front of it have that distance.
+ * has the depth d, measures the signed distance d - z, positive in front of the surface.  Points behind the surface by
+ * more than the truncation are hidden; points in front of it by more than the truncation get the truncation.
  *
  * One item = one grid point.  No local memory.  Deterministic: one launch per view, each item adds to its own sums. */
 #include "common.h"

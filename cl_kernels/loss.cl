@@ -4,7 +4,8 @@
  * = one row of one channel; each sum is written once.  Deterministic. */
 #include "planes.h"
 
-/* 8-bit pixels times a factor to float planes.  One item = LANES pixels of one channel; dimensions x, y, channel. */
+/* Convert 8-bit pixels, times a factor, to float planes.  One item = LANES pixels of one channel; dimensions x, y,
+ * channel. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void unpack_pixels(
     __global const uchar *restrict pixels,  // [channels,height,width]

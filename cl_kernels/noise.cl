@@ -2,8 +2,8 @@
  *
  *   mean += rate / (1 + exp(-100 (opacity_below - opacity))) Sigma n,  Sigma = R diag(s^2) R^T,  n: normal, [3]
  *
- * and no noise where the opacity is REACH above opacity_below.  One item = one Gaussian.  No local memory.  Random
- * numbers depend only on (seed, step, Gaussian). */
+ * Gaussians with an opacity above opacity_below + REACH get no noise.  One item = one Gaussian.  No local memory.
+ * Random numbers depend only on (seed, step, Gaussian). */
 #include "random.h"
 
 __constant float SHARPNESS = 100.0f;  // per unit of opacity: how fast the noise falls at opacity_below

@@ -4,8 +4,9 @@
  * variances: `filter_variance`, scene units^2, is added to the squared scales, `screen_variance`, px^2, to the screen
  * covariance.
  * The opacity is multiplied by the energy factor of the first, and with `compensate` = 1 also by that of the second
- * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11), and by a constant factor, which does not change the derivative by a
- * logit: the sum over pixels of dL/dpower times 1 - sigmoid.  With PIXEL_BOX `screen_variance` and `compensate` are 0.
+ * (Mip-Splatting, Yu et al. 2024, eq. 9 and 11), and by a constant factor.  None of them changes the derivative with
+ * respect to the logit: the sum over pixels of dL/dpower times 1 - sigmoid.  With PIXEL_BOX `screen_variance` and
+ * `compensate` are 0.
  *
  * One item = LANES Gaussians.  No local memory.  Deterministic: no item writes values that another reads. */
 #include "backward.h"

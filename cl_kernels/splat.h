@@ -77,7 +77,7 @@ typedef struct {
 typedef struct {
     line_t line;
     slopes_t slopes;  // known in the backward pass
-    VF place;         // of the pixels across the lines, px
+    VF place;         // position of the pixels across the lines, px
     bool turned;
     float opacity;
     float alpha_min;  // above 1, so that no pixel is hit, when the row is outside the splat's extent

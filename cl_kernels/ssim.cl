@@ -1,4 +1,4 @@
-/* D-SSIM between a rendered image and a photograph, value and gradient, and the gradient of an L1 before it.
+/* D-SSIM between a rendered image and a photograph, value and gradient, with an optional L1 loss.
  *
  * SSIM: 11x11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01^2, C2 = 0.03^2 (Wang et al. 2004, as 3DGS uses it).
  * Planes are [channels,H',W'] with H', W' whole tiles, zero outside the image; gradients too.  One group of SSIM_TEAM

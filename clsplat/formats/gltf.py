@@ -3,8 +3,8 @@
     POSITION 3 · ROTATION x y z w, unit · SCALE 3, linear · OPACITY in [0, 1] · SH_DEGREE_l_COEF_m 3, in the order and
     with the signs of f_rest · COLOR_0 r g b a, linear, for viewers without the extension
 
-Axes of glTF are x right, y up, z back.  The Gaussians are converted instead of rotating the node, because the extension
-does not specify whether viewers rotate SH with a node.
+Axes of glTF are x right, y up, z back.  Gaussians are converted to these axes; their node is not rotated,
+because the extension does not specify whether viewers rotate SH with a node.
 """
 
 import base64
@@ -52,11 +52,11 @@ LOG = logging.getLogger("clsplat")
 EXTENSION = "KHR_gaussian_splatting"
 PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|texture)_.*|.*spz.*")  # or no effect
+SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|texture)_.*|.*spz.*")  # or without effect
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-MAX_READS = 8  # largest average number of reads of a byte; equal columns may share an accessor
+MAX_READS = 8  # largest average number of reads per byte; equal columns may share an accessor
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
-LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # signs that convert the axes of a PLY
+LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # converts between these axes and those of a PLY
 MAX_NAME = 500  # characters of a file name, and of a data URI before its data
 MAX_TEXT = 1 << 29  # bytes of a .gltf
 
@@ -71,7 +71,7 @@ class Gltf:
         self.path, self.tree, self.binary = path, tree, binary
         self.bytes_left = self.spz_bytes = 0  # bytes that may still be read, and bytes of unpacked SPZ data
         self.files: dict[str | None, bytes] = {}  # the content of buffers, by their URIs
-        self.notes: set[str] = set()  # about the file, for the user
+        self.notes: set[str] = set()  # remarks about the file, for the user
         self.is_mip = False
         if unknown := [name for name in tree.get("extensionsRequired", []) if not SUPPORTED.fullmatch(name)]:
             names = first_few(list(map(quote, unknown)))

@@ -18,8 +18,8 @@ from clsplat.formats.splats import FLIP, MAX_LOG, SH_C0, SplatFile, WriteOptions
 
 Floats = NDArray[np.float64]
 TRIANGLES = 4  # mode of a primitive in glTF
-UNLIT = "KHR_materials_unlit"  # the colors include the light of the photos
-ROWS = 4096  # of text, formatted at once
+UNLIT = "KHR_materials_unlit"  # the colors already contain the lighting of the photos
+ROWS = 4096  # rows of text formatted at once
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Mesh:
         return bool((self.edge_counts() == 2).all())
 
     def select(self, is_kept: NDArray[np.bool_]) -> "Mesh":
-        """Return the mesh with only the faces of a mask, [F], and the vertices of these faces."""
+        """Return the mesh with only the faces for which a mask, [F], is True, and the vertices of these faces."""
         rows, faces = np.unique(self.faces[is_kept], return_inverse=True)
         return Mesh(self.vertices[rows], faces.reshape(-1, 3), self.colors[rows])
 

@@ -23,7 +23,7 @@ def fit_codebook(values: NDArray[np.floating], step: float | None = None) -> NDA
     rounds of Lloyd's iteration (1982) compute the codebook.  Between rounds, pairs of cells are merged and other cells
     are split while this reduces the error.
     """
-    sorted_values = np.sort(values.astype(np.float64) + 0.0, axis=None)  # makes -0 equal to 0, whose order is undefined
+    sorted_values = np.sort(values.astype(np.float64) + 0.0, axis=None)  # -0 becomes 0: their order is undefined
     for candidates in [sorted_values] + ([np.rint(sorted_values / step) * step] if step else []):
         unique_values = np.unique(candidates)
         if len(unique_values) <= ENTRIES:

@@ -326,11 +326,11 @@ class _Sog:
 
 PALETTES = {"small": 1024, "balanced": 4096, "high": 16384}  # maximum palette entries in training
 RELATIVE_PALETTES = {"small": 0.16, "balanced": 0.42, "high": 0.45}  # palette entries per splat, outside training
-MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # of palette vectors, in units of 1/128
-QUAT_STEP = 4  # of quaternions, in units of 1/255
-SIZE_STEP = 0.25  # step of positions of median weight, relative to the Gaussian's size
-SCALE_STEP = 0.1  # of log scales
-COLOR_STEP = 0.05  # of coefficients of band 0; 1 changes a color by 0.28
+MEDIAN_STEPS = {"small": 6.0, "balanced": 5.0, "high": 3.0}  # rounding steps of palette vectors, in units of 1/128
+QUAT_STEP = 4  # rounding step of quaternions, in units of 1/255
+SIZE_STEP = 0.25  # rounding step of positions for a Gaussian of median weight, relative to its size
+SCALE_STEP = 0.1  # rounding step of log scales
+COLOR_STEP = 0.05  # rounding step of coefficients of band 0; a change of 1 changes a color by 0.28
 BASE_ENTRIES = 1024  # palette entries in training for 1,024 splats; more splats get more entries
 DIGITS = 16  # digits of the SHA-256 in the names of images in a folder
 

@@ -90,8 +90,8 @@ def _axes(rotations: NDArray[np.float64]) -> NDArray[np.intp]:
 
 # Round SH with little visible error, from the model alone.
 
-ISOTROPIC = 0.02  # weight of a uniform distribution of directions added to the moments; 0.005 to 0.1 differ little
-TYPICAL_RMS = 0.028  # of SH coefficients: fox after 7,000 steps; lego has 0.037, kitchen 0.043
+ISOTROPIC = 0.02  # weight of uniformly distributed directions in the moments; 0.005 to 0.1 give similar results
+TYPICAL_RMS = 0.028  # RMS of the SH coefficients of fox after 7,000 steps; lego has 0.037, kitchen 0.043
 ROWS = 1 << 15  # rows rounded at once
 
 
@@ -108,7 +108,7 @@ def scaled_step(rest: Floats, step: float, max_step: float) -> float:
 
 
 def visible_form(rest: Floats) -> NDArray[np.float64]:
-    """Return the quadratic form of visible errors of SH, [N, 3 K]: a matrix, [K, K], with a trace of about K.
+    """Return a quadratic form that measures visible errors of SH, [N, 3 K]: a matrix, [K, K], with a trace of about K.
 
     The result is bit-identical for any number of threads.
     """
@@ -143,7 +143,7 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
     form: the metric to minimize, [K, K], from `visible_form`.
     """
     count = len(form)
-    # with the metric G, (G^-1) reversed = U^T U: row k of U says how later coefficients compensate an error of k
+    # with the metric G, (G^-1) reversed = U^T U: row k of U is how later coefficients compensate for an error in k
     inverse = np.linalg.inv(form[::-1, ::-1])
     feedback = np.linalg.cholesky(inverse).T.astype(np.float32)
     feedback /= np.diag(feedback)[:, None].copy()
@@ -166,7 +166,7 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
 LLOYD_STEPS = 3  # per split
 SPLIT_FRACTION = 0.5  # largest fraction of clusters split before errors are recomputed
 TINY_WEIGHT = 1e-300  # replaces the weight of an empty cluster
-SH_LEVELS = 128  # in a coefficient of 1
+SH_LEVELS = 128  # levels in a coefficient of 1
 MAX_STEP = 64.0  # levels
 Labels = NDArray[np.int64]
 

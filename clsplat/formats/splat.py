@@ -106,7 +106,7 @@ HEADER, SECTION = 4096, 1024  # bytes
 MAX_DEGREE = 2
 SH_RANGE = (-1.5, 1.5)
 RANGE = 32767
-# position, scale and rotation, SH by level
+# types of position, of scale and rotation, and of SH, for each compression level
 FIELD_TYPES = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
 
 
@@ -133,7 +133,7 @@ class SplatSection:
         return cls(count, rows, degree, size, buckets, block, bucket_bytes, scale or RANGE, full, partial)
 
     def row_dtype(self, level: int) -> np.dtype[Any]:
-        """Return the layout of one splat."""
+        """Return the layout of one splat at a compression level."""
         position, scale, sh = FIELD_TYPES[level]
         fields: list[Any] = [("position", position, 3), ("scale", scale, 3), ("rotation", scale, 4)]
         fields += [("color", "u1", 4), ("sh", sh, 3 * (sh_coefficients(self.degree) - 1))]
@@ -160,7 +160,7 @@ def read_ksplat(path: Path) -> SplatFile:
         raise DataError(f"{path}: has no splats; export it again")
     if not looks_like_ksplat(data, len(data)):
         raise DataError(f"{path}: not a .ksplat file of version 0.1 with a header of {HEADER} bytes; copy it again")
-    sections = sections or max_sections  # `sections` counts those loaded so far; some writers leave it at 0
+    sections = sections or max_sections  # `sections` counts the sections loaded so far; some writers leave it at 0
     sh_range = struct.unpack_from("<2f", data, 36)
     start = HEADER + SECTION * max_sections
     require_size(path, len(data), start, f"{max_sections} sections")

@@ -84,7 +84,7 @@ MAX_FILE = 1 << 33  # bytes
 MAX_VALUE = 1e15  # of the tables in BOUNDED; viewers and codebooks fail beyond it
 BOUNDED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
-# fraction of the values outside their range from which another unit is assumed; mirrored axes have negative scales, too
+# fraction of out-of-range values above which another unit is assumed; mirrored axes also have negative scales
 MIN_OUTSIDE = 0.5
 MAX_EXPONENT = 700.0  # of exp in float64
 MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
@@ -93,7 +93,7 @@ FLATNESS = -6.907755  # log 1e-3: largest ratio of that axis to the others
 # axes in which the functions of bands 1 to 3 are odd
 PARITY = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 FLIP = (1.0, -1.0, -1.0)  # between y down, z forward, and y up, z back
-FLIP_4 = np.diag([*FLIP, 1.0])  # converts matrices [4, 4] likewise
+FLIP_4 = np.diag([*FLIP, 1.0])  # the same for matrices, [4, 4]
 Quality = Literal["small", "balanced", "high"]  # precision of SPZ and SOG
 Parameters = dict[str, NDArray[np.float32]]  # by the names in PARAMETERS, each [N, components]
 Floats = NDArray[np.floating]
@@ -142,7 +142,7 @@ class WriteOptions:
     quality: Quality = "balanced"  # SPZ and SOG
     quiet: bool = False  # do not warn about what the format does not store
     world: bool = False  # positions in world coordinates, instead of an origin
-    collider: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None  # OpenUSD: vertices, world, [V, 3]; faces
+    collider: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None  # OpenUSD: world vertices, [V, 3]; faces
 
 
 def sh_coefficients(degree: int) -> int:
@@ -233,7 +233,7 @@ def transform(
     if not scale > 0 or rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5):
         raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
     if np.linalg.det(rotation) < 0:
-        raise ValueError("expected a rotation; this matrix mirrors")
+        raise ValueError("expected a rotation; this matrix is a reflection")
     return {
         "means": scale * parameters["means"].astype(np.float64) @ rotation.T + translation,
         "quats": multiply(unit_quaternions(rotation), parameters["quats"].astype(np.float64)),
@@ -245,7 +245,7 @@ def transform(
 def join_parts(
     path: Path, parts: Iterable[tuple[Parameters, NDArray[np.float64]]]
 ) -> tuple[Parameters, NDArray[np.float64] | None]:
-    """Return the Gaussians of all parts relative to the first, and the placement of the first, None for the identity.
+    """Return the Gaussians of all parts relative to the first, and the placement of the first (None: the identity).
 
     parts: Gaussians in the axes of a PLY, and a matrix, [4, 4], in axes with y up and z back.  Raises DataError.
     """

@@ -7,10 +7,10 @@ Planes of bytes are compressed with gzip (versions 1 to 3) or Zstandard (4):
     positions  int24 of x 2^bits (version 1: float16) · alphas  255 opacity · colors  255 (0.15 f_dc + 1/2)
     scales     16 (log s + 10) · rotations  index of the largest of x y z w << 30, the other three as a sign and 9 bits
                of 511 |c| sqrt 2 (versions 1, 2: x y z as 127.5 c + 127.5, where w >= 0)
-    harmonics  128 f + 128, coefficient-major, to 1/2^(bits - 1)
+    harmonics  128 f + 128, coefficient-major, f rounded to multiples of 1/2^(bits - 1)
 
-Axes are x right, y up, z back, unless an extension record names others.  Some programs keep the axes of the PLY, and
-the file does not say so.
+Axes are x right, y up, z back, unless an extension record names others.  Some programs keep the axes of the PLY without
+declaring them.
 """
 
 import io
@@ -310,7 +310,7 @@ def _open_zstd(data: bytes) -> tuple[Any, type[Exception]]:
     try:
         import zstandard
     except ImportError as error:
-        raise ConfigError("SPZ version 4 needs Zstandard; in a checkout, pip install '.[spz]'") from error
+        raise ConfigError("SPZ version 4 needs Zstandard; in a checkout, run `pip install '.[spz]'`") from error
     return zstandard.ZstdDecompressor(max_window_size=1 << MAX_WINDOW).stream_reader(data), zstandard.ZstdError
 
 

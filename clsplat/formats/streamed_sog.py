@@ -197,8 +197,8 @@ Rows = NDArray[np.intp]
 class LeafLimits:
     """The limits of a leaf; the defaults are those of PlayCanvas."""
 
-    splats: int = 512 * 1024  # of all levels; a file exceeds it by one leaf at most
-    extent: float = 4.0  # longest side of the box of the means, in typical sizes: 16 scene units at a size of 4
+    splats: int = 512 * 1024  # largest number, of all levels; a file exceeds it by one leaf at most
+    extent: float = 4.0  # longest side of the box of the means, in typical sizes: 16 scene units for a size of 4
     min_splats: int = 1024  # leaves with no more splats are not split because of their extent
 
 

@@ -64,13 +64,13 @@ class Codec:
     read: Callable[[Path, ReadOptions], SplatFile] | None = None
     write: Callable[[Path, SplatFile, WriteOptions], str] | None = None  # returns the SHA-256
     command: str = ""  # the only command that writes this format
-    keeps_all: bool = False  # the world filter, motion, values that are not finite, and positions in float64
-    keeps_mode: bool = True  # whether a model is a mip model
-    keeps_rendering: bool = False  # rendering settings
-    keeps_origin: bool = False  # apart from the rendering settings
+    keeps_all: bool = False  # stores the world filter, motion, values that are not finite, and positions in float64
+    keeps_mode: bool = True  # stores whether a model is a mip model
+    keeps_rendering: bool = False  # stores rendering settings
+    keeps_origin: bool = False  # stores the origin without the other rendering settings
     has_quality: bool = False  # writing uses WriteOptions.quality
     has_magic: bool = True  # a magic number, or another clear mark at the start of files
-    is_model: bool = True  # not only points
+    is_model: bool = True  # stores Gaussians, not only points
     has_collider: bool = False  # writing uses WriteOptions.collider
 
 
@@ -241,7 +241,7 @@ def writing_format(path: Path) -> Codec:
     codec = format_from_name(path)
     if codec is None or codec.write is None:
         remedy = f"is only written by `{codec.command}`" if codec and codec.command else "can be read but not written"
-        fault = f"{codec.name} {remedy}" if codec else f"no format has the name {quote(path.name)}"
+        fault = f"{codec.name} {remedy}" if codec else f"no format matches the name {quote(path.name)}"
         raise ConfigError(f"{shorten(str(path))}: {fault}; use a name that ends in {', '.join(endings())}")
     return codec
 

@@ -168,7 +168,7 @@ def read_usd(path: Path) -> SplatFile:
         parts = [(_read_parameters(path, prim, notes), axes @ _matrix(path, parents)) for prim, parents in prims]
     except (ValueError, LookupError, RuntimeError, DeprecationWarning, zipfile.BadZipFile) as error:
         raise DataError(
-            f"{path}: is damaged, or has values of unknown kinds ({one_line(error)}); copy or export it again"
+            f"{path}: is damaged, or has values of unsupported types ({one_line(error)}); copy or export it again"
         ) from error
     if not parts:
         raise DataError(f"{path}: has no prim {SPLAT.decode()}, which OpenUSD 26.03 defines; export it again")
@@ -185,7 +185,7 @@ def _read_layer(path: Path) -> bytes:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             first = archive.infolist()[0]
             if first.compress_type != zipfile.ZIP_STORED:
-                raise DataError(f"{path}: {quote(first.filename)} is compressed, which .usdz excludes; export it again")
+                raise DataError(f"{path}: {quote(first.filename)} is compressed, not stored; export it again")
             data = archive.read(first)
     if not data.startswith(b"#usda"):
         kind = "a binary OpenUSD file" if data.startswith(b"PXR-USDC") else "not an OpenUSD text file"
@@ -194,7 +194,7 @@ def _read_layer(path: Path) -> bytes:
 
 
 def _parse(text: bytes) -> tuple[Prim, list[tuple[Prim, Sequence[Prim]]]]:
-    """Return the metadata of a stage, and each prim with Gaussians, with its parents and itself."""
+    """Return the metadata of a stage, and each prim with Gaussians, with its parents and itself, in order."""
     stack: list[Prim] = [{}]
     prims: list[tuple[Prim, Sequence[Prim]]] = []
     following: Prim = {}
@@ -225,7 +225,7 @@ def _read_parameters(path: Path, prim: Prim, notes: set[str]) -> Parameters:
     def table(name: str, width: int) -> NDArray[np.float32]:
         value = prim.get(name.encode(), prim.get(f"{name}h".encode()))  # 16-bit floats
         if value is None:
-            raise DataError(f"{path}: its Gaussians have no {name}; export it again, without time samples")
+            raise DataError(f"{path}: its Gaussians have no {name}; export the file again, without time samples")
         return _numbers(value).reshape(-1, width).astype(np.float32)
 
     means = table("positions", 3)

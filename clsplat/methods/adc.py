@@ -14,7 +14,7 @@ class Grow(Rule):
     """Base class of rules that turn a Gaussian into several if the mean of a statistic is large.
 
     With `as_many_as`, the number of Gaussians that grow is the number that reach `gradient_above` in that statistic;
-    those with the largest `statistic` grow (Gaussian Opacity Fields, Yu et al. 2024).
+    the Gaussians with the largest `statistic` grow (Gaussian Opacity Fields, Yu et al. 2024).
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"gradient_above", "opacity"})

@@ -33,7 +33,7 @@ def squared_error(survey: Survey, views: list[View]) -> float:
 
 
 def evaluate_without(gaussians: Gaussians, rows: NDArray[np.intp], function: Callable[[], float]) -> float:
-    """Return `function()` while the Gaussians in `rows` are invisible; restore them afterwards."""
+    """Make the Gaussians in `rows` invisible, call `function`, restore the Gaussians, and return the result."""
     logits = gaussians.get("logit_opacity")
     hidden_logits = logits.copy()
     hidden_logits[rows] = HIDDEN_LOGIT

@@ -10,7 +10,7 @@ from clsplat.losses.base import LossValue, Penalty, PenaltyInputs
 
 
 class OpacityPressure(Penalty):
-    """Mean of max(l - `floor`, 0) over the opacity logits l, which lowers all of them equally.
+    """Mean of max(l - `floor`, 0) over the opacity logits l; the penalty lowers all of them equally.
 
     Only Gaussians that the image loss needs stay opaque; `prune_faint` removes the others.
     """

@@ -25,10 +25,11 @@ class Haar(TrainingModule):
     2025).
 
     The photo passes through one level of the Haar transform and its inverse.  The high-pass analysis filter is
-    h = s (1, -1) / √2 + l (1, 1) / √2 with learned scale s and leak l.  Both start at zero, which averages squares of
-    2 x 2 px.  They are trained by the losses on images and by the loss weight · 2 ((1 - s)² + l²), which pulls h to
-    Haar's filter, which leaves the photo unchanged.  A masked pixel becomes the mean of the unmasked pixels in its
-    square.  All losses on images must be symmetric in render and photo.
+    h = s (1, -1) / √2 + l (1, 1) / √2 with learned scale s and leak l.  Both start at zero, so that the photo is
+    averaged over squares of 2 x 2 px.  They are trained by the losses on images and by the loss
+    weight · 2 ((1 - s)² + l²).  This loss pulls h toward Haar's filter, with which the photo does not change.  A masked
+    pixel becomes the mean of the unmasked pixels in its square.  All losses on images must be symmetric in render and
+    photo.
     """
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"rate", "weight"})

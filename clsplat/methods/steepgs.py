@@ -2,7 +2,7 @@
 
 This is the case if the splitting matrix S has a negative eigenvalue.  If a Gaussian's weight in the pixels is replaced
 with the mean of two copies moved by ±ε v, the loss changes by ε²/2 vᵀ S v + O(ε⁴).  Two Gaussians, each with a
-part of its opacity, form such a mean, except for the product of their alphas.
+part of the opacity, form such a mean, up to the product of their alphas.
 """
 
 from typing import Annotated, ClassVar, Literal

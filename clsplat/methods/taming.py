@@ -30,7 +30,7 @@ def pixel_weights(render: RenderedView) -> Floats:
 
 
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
-    """Return two sums over sampled views for each Gaussian, [N]: of the view's loss, and of its terms times that loss.
+    """Return two sums over sampled views for each Gaussian, [N]: the view's loss, and the Gaussian's terms times it.
 
     Only views in which the Gaussian is visible count.  The terms of a Gaussian are its depth, its radius, and three
     sums over the pixels where it is blended: `pixel_weights`, the number of pixels, and its blend weights.
@@ -40,7 +40,7 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
     for view, render in zip(sampled_views, survey.render(sampled_views), strict=True):
         radius = render.radius()
         row = view.world_to_camera[2]
-        depth = (render.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # BLAS bits depend on threads
+        depth = (render.model.gaussians.get("means") * row[:3]).sum(axis=1) + row[3]  # BLAS sums depend on threads
         textures = pixel_weights(render), np.ones(render.counted_pixels().shape)
         sums = [render.sum(BLENDED, texture) for texture in textures]
         values = (5, depth), (10, radius), (10, sums[0]), (0.1, sums[1]), (50, render.sum(WEIGHT))

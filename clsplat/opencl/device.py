@@ -89,7 +89,7 @@ class Buffer(cl.Buffer):
     """A buffer in device memory that, unlike pyopencl's class, supports weak references."""
 
     serial: int  # number that no other buffer has
-    copy: Any  # event of the last copy that nobody waited for
+    copy: Any  # event of the last copy that `set_later` enqueued
 
 
 _SERIALS = itertools.count(1)
@@ -101,7 +101,7 @@ class Recording(threading.local):
     plan: Any = None
 
     def invalidate(self) -> None:
-        """Mark the plan as not replayable, because of a command that is not a launch."""
+        """Mark the plan as not replayable, because the part contains a command other than a launch."""
         if self.plan is not None:
             self.plan.is_replayable = False
 
@@ -148,7 +148,7 @@ class Array:
         return wait
 
     def get_item(self, index: int) -> Any:
-        """Copy one value of a one-dimensional array to the host.  Waits, and raises the errors of `get`."""
+        """Copy one value of a one-dimensional array to the host, and wait for it, like `get`."""
         return self.get_item_later(index)()
 
     def get_item_later(self, index: int) -> Callable[[], Any]:
@@ -188,7 +188,7 @@ class Device:
     A `with` block waits for all work when it ends.  Memory is released with the arrays, and the device with the last
     object that uses it.
 
-    `name` is a part of a runtime's or device's name, as `clsplat devices` prints them.  By default, the device is
+    `name` is a part of a runtime's or device's name, as printed by `clsplat devices`.  By default, the device is
     the one named in CLSPLAT_DEVICE, else the strongest GPU that works, else the first CPU.
     Raises DeviceError if there is none, MemoryLimitError or DeviceError if the runtime cannot open it.
     """
@@ -404,7 +404,7 @@ def _parse_argument(kernel: str, text: str) -> Argument:
         return Argument(pointer["name"], _TYPES.get(str(pointer["type"])), True)
     if scalar:
         return Argument(scalar["name"], _TYPES[str(scalar["type"])], False)
-    raise KernelError(f"{kernel}: cannot read the parameter '{text.strip()}'")
+    raise KernelError(f"{kernel}: cannot parse the parameter '{text.strip()}'")
 
 
 def group_limit(kernel: Any, device: Any) -> int:

@@ -1,6 +1,6 @@
 """Find the OpenCL devices of this machine and choose one.
 
-The device is chosen once and passed explicitly; nothing silently falls back to another one.
+The device is chosen once and passed explicitly; clsplat never falls back to another device silently.
 """
 
 import logging

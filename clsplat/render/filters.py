@@ -199,7 +199,7 @@ class ModelSettings(Settings):
     """Smallest depth in scene units that is rendered; `auto`: 4% of the scene's extent, or half of the 1% quantile of
     the depths of observed points, if that is less.  A run writes the value."""
     near_auto: Annotated[float, Field(gt=0, lt=MAX_NUMBER)] | None = None
-    """Written by a run: the value that `auto` chose.  If `near` still equals it, other photos change both."""
+    """Written by a run: the value that `auto` chose.  If `near` still equals it, other photos replace both."""
     world_filter: OneOf[WorldFilter] = NoWorldFilter()
     """Blur of Gaussians in the world."""
     screen_filter: OneOf[ScreenFilter] = Dilation()

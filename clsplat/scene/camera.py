@@ -15,7 +15,7 @@ from clsplat.core.errors import DataError, quote
 
 MAX_SIDE = 4096 * 8  # px: tiles per side that cl_kernels/tiles.h can index, times the smallest tile size
 MAX_PHOTO_SIDE = 32764  # px: OpenCV cannot remap larger photographs
-MIN_FOCAL = 1e-3  # px, in a dataset: a shorter one would cover nearly half of all directions
+MIN_FOCAL = 1e-3  # px, in a dataset: a shorter focal length means a field of view of almost 180 degrees
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Camera:
         all values are finite.
         """
         if not (isinstance(self.width, Integral) and isinstance(self.height, Integral)):
-            raise ValueError(f"the camera is {self.width}x{self.height}; expected integers")
+            raise ValueError(f"the camera is {self.width}x{self.height}; expected an integer width and height")
         if max(self.width, self.height) > MAX_SIDE:
             raise ValueError(f"the camera is {self.width}x{self.height} pixels; expected at most {MAX_SIDE} per side")
         if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, astuple(self))):
@@ -56,7 +56,7 @@ class Camera:
         return Camera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
     def downscaled(self, factor: float) -> "Camera":
-        """Return the camera after dividing the image size by `factor`, rounded to whole pixels."""
+        """Return the camera with its image size divided by `factor` and rounded to whole pixels."""
         if factor == 1:
             return self
         return self.resized(max(1, round(self.width / factor)), max(1, round(self.height / factor)))
@@ -65,11 +65,11 @@ class Camera:
 # Lenses with distortion: COLMAP's camera models, and undistortion of photographs.
 
 Floats = NDArray[np.float64]
-Distortion = Callable[..., tuple[Floats, Floats]]  # of (u, v, k), or of (x, y, k, z) for directions in models of WIDE
+Distortion = Callable[..., tuple[Floats, Floats]]  # f(u, v, k), or f(x, y, k, z) for directions in WIDE models
 BORDER_POINTS = 200  # per edge of a photograph
 MAX_ITERATIONS = 50  # of Newton's method
 MAX_ERROR = 1.0e-6  # of the result of Newton's method, normalized units
-MAX_DIFFERENCE = 1.0e-3  # of a ray after distortion and undistortion, normalized units
+MAX_DIFFERENCE = 1.0e-3  # between a ray and its value after distortion and undistortion, normalized units
 MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond it, a pinhole image is mostly stretched edges
 MAX_GROWTH = 2.0  # size of an undistorted photograph, relative to the original
 
@@ -167,15 +167,15 @@ WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models that also cover dire
 
 # Wide photographs: panoramas and fisheyes of about 180 degrees or more are cut into the faces of a cube.
 
-MIN_WIDE = math.radians(80)  # from the axis to a side of the image: a pinhole image would be 3.6 times as wide
-MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle or its nearest edge, whichever is farther
+MIN_WIDE = math.radians(80)  # from the optical axis to a side; a pinhole image would be several times as wide
+MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle or the angle of its nearest edge
 RIM = 1.5  # px: samples at the edge of a fisheye's circle would mix with the dark pixels around it
 FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap
-FACE_GRID = 128  # directions along a side at which the visible part of a face is measured
+FACE_GRID = 128  # grid points per side at which the visible part of a face is measured
 MIN_VISIBLE = 0.02  # visible fraction of a face below which the face is left out
 ANGLE_COUNT = 1801  # number of samples from 0 to 180 degrees
-BLOCK = 1 << 20  # samples at a time
-# rotations from the camera of the photograph to that of the face; the rows are its right, down, and forward axes
+BLOCK = 1 << 20  # rays processed at a time
+# rotations from the photograph's camera to the face's camera; the rows are the face's right, down, and forward axes
 FACES: dict[str, Floats] = {
     "front": np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]),
     "right": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
@@ -234,7 +234,7 @@ class Lens:
     def faces(self) -> tuple["Lens", ...]:
         """The lenses of the faces of a wide photograph.
 
-        They are the front, and each other face of which at least a fraction MIN_VISIBLE is visible in the photograph.
+        These are the front face, and every other face whose visible fraction is at least MIN_VISIBLE.
         """
         lenses = [intern_lens(replace(self, face=face, keep_border=self.model != "EQUIRECTANGULAR")) for face in FACES]
         return tuple(lens for lens in lenses if lens.face == "front" or lens._visible_grid.mean() >= MIN_VISIBLE)
@@ -425,7 +425,7 @@ def panorama_lens(width: int, height: int) -> Lens:
 
 
 def _newton_step(distortion: Distortion, k: Sequence[float], points: Floats, target: Floats) -> Floats:
-    """Return points, [2, M], after one step of Newton's method toward the points that are distorted to `target`."""
+    """Return points, [2, M], after one step of Newton's method toward the points that the lens maps to `target`."""
     h, (u, v) = 1e-7, points
     x, y = distortion(u, v, k)
     xu, yu = distortion(u + h, v, k)

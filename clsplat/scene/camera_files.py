@@ -21,7 +21,7 @@ from clsplat.scene.scene import Scene
 from clsplat.scene.transforms_json import POINTS_FILE, TRANSFORMS_FILE, JsonFrame, opengl_matrix
 from clsplat.scene.view import NO_FILE, Floats, View, load_exposures, photo_lens
 
-# The views of a scene, named like their images below one folder.
+# Rename the views of a scene to the paths of their images in one folder.
 
 IMAGES = "images"  # the folder of the photographs, as in COLMAP and nerfstudio
 
@@ -29,7 +29,7 @@ IMAGES = "images"  # the folder of the photographs, as in COLMAP and nerfstudio
 def with_image_names(scene: Scene) -> Scene:
     """Return the scene with views named like their images.
 
-    Raises DataError for duplicate names and for names that are not one line of text.
+    Raises DataError for duplicate names, and for names with unprintable characters or spaces at either end.
     """
     names = []
     for view in scene.views:  # some formats leave out the suffix of the file
@@ -40,7 +40,7 @@ def with_image_names(scene: Scene) -> Scene:
     previous_names: set[str] = set()
     for name in names:
         if not name.isprintable() or name != name.strip():
-            raise DataError(f"{scene.path}: an image is named {quote(name)}; expected a name on a single line")
+            raise DataError(f"{scene.path}: an image is named {quote(name)}; remove spaces at its ends and line breaks")
         if name in previous_names:
             raise DataError(f"{scene.path}: two images would be named {quote(name)}; rename one")
         previous_names.add(name)
@@ -48,9 +48,9 @@ def with_image_names(scene: Scene) -> Scene:
 
 
 def plan_copies(views: Sequence[View], folder: Path) -> dict[Path, Path]:
-    """Return a dictionary from the path of each photograph's copy in `folder` to the photograph.
+    """Return a dictionary from the path of each copy in `folder` to the path of the photograph to copy.
 
-    Raises DataError if a view has no photograph, or only a part of a wide one.
+    Raises DataError if a view has no photograph or is one face of a wide photograph.
     """
     for view in views:
         if view.image_path == NO_FILE:
@@ -76,7 +76,7 @@ TOLERANCE = 0.5  # px: smaller offsets come from different conventions for pixel
 def write_inria(out: Path, scene: Scene) -> list[Path]:
     """Write out/cameras.json, without points and tracks, and return its path in a list.  Raises OutputError.
 
-    Warns if a principal point is not at the center of the image, where other programs assume it.
+    Warns if a principal point is not at the center of the image, because other programs assume that it is.
     """
     write_text(out / INRIA_FILE, json.dumps([_entry(view, i) for i, view in enumerate(scene.views)], indent=1) + "\n")
     cameras = [view.camera for view in scene.views]
@@ -160,7 +160,7 @@ REMEDY = "use --format colmap, or run `clsplat data undistort` first"
 def write_nerfstudio(out: Path, scene: Scene) -> list[Path]:
     """Write out/transforms.json and the points (without their tracks), if there are any; return the paths.
 
-    The test views are also listed as validation views, because nerfstudio evaluates those.  Raises OutputError.
+    The test views are also listed as validation views, which nerfstudio evaluates.  Raises OutputError.
     """
     lenses = [_lens_fields(view) for view in scene.views]
     model, common_fields = lenses[0]["camera_model"], lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
@@ -218,13 +218,13 @@ OUTPUTS = {  # the files of each format
     "inria": [Path(INRIA_FILE)],
 }
 UNDISTORTED = ("inria",)  # formats without lens distortion
-COPIES = ("none", "copy")  # of the photographs
+COPIES = ("none", "copy")  # the values of `images` in write_cameras
 SPLIT_FORMAT = "nerfstudio"  # the format that stores the split and times
 TRACKS_FORMAT = "colmap"  # the format that stores which points each photograph shows
 
 
 def check_cameras(scene: Scene, format_: str) -> Scene:
-    """Return the scene with views named like their images.  Raises DataError if the format cannot represent it."""
+    """Return the scene with views named like their images.  Raises DataError if the format cannot store it."""
     renamed_scene, view_by_model = with_image_names(scene), dict[str, str]()
     for view in renamed_scene.views if format_ == "nerfstudio" else ():
         if (model := photo_lens(view).model) not in DISTORTION:
@@ -243,8 +243,8 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
     """Write the cameras of a scene and, with `images="copy"`, copies of the photographs and their exposures.
 
     Returns the paths of the camera files.  The scene must not be downscaled.  overwrite: whether to replace existing
-    files.  Raises ConfigError for an unknown format and for an existing file, and DataError if the format cannot
-    represent the scene.
+    files.  Raises ConfigError for an unknown format and for an existing file, and DataError if the format cannot store
+    the scene.
     """
     for name, value, choices in (("format", format_, tuple(WRITERS)), ("images", images, COPIES)):
         if value not in choices:

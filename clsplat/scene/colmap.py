@@ -321,7 +321,7 @@ class ColmapReader(Reader):
     test view.
 
     Photographs of cameras with distortion are undistorted when they are read.  The folder `masks` may contain masks,
-    named like the images, with .png appended or as the suffix.  With a file `images/times.json` that lists the time of
+    named like the images, with .png added or as the new suffix.  With a file `images/times.json` that lists the time of
     each image, the scene is dynamic.
     """
 
@@ -410,7 +410,7 @@ def _read_largest_model(path: Path) -> tuple[Path, list[ImageRecord]]:
     models = [(folder, read_images(folder)) for folder in find_models(path)]
     if not models:
         raise DataError(
-            f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in it, sparse, or sparse/0"
+            f"{path}: no COLMAP model; expected cameras and images (.bin or .txt) in this folder, sparse, or sparse/0"
         )
     best = max(models, key=lambda model: len(model[1]))
     if unused_models := ", ".join(f"{folder} ({len(images)})" for folder, images in models if folder != best[0]):
@@ -435,7 +435,7 @@ def make_view(
     if image.camera not in cameras:
         raise DataError(
             f"{image.source}: image {quote(image.name)} has camera {image.camera}; expected an ID in the cameras file, "
-            f"{sorted(cameras)[:8]}: {REMEDY}"
+            f"such as {sorted(cameras)[:8]}: {REMEDY}"
         )
     try:
         pose = pose_matrix(image.quaternion, image.translation)
@@ -478,6 +478,6 @@ def pose_matrix(quaternion: Sequence[float], translation: Sequence[float]) -> ND
     if sizes != (4, 3) or not 0 < length < math.inf or not all(abs(value) < MAX_VALUE for value in translation):
         raise ValueError(
             f"quaternion {quote(tuple(quaternion))}, translation {quote(tuple(translation))}; "
-            "expected finite numbers and a rotation"
+            "expected finite numbers and a quaternion that is not zero"
         )
     return np.column_stack([rotation_matrix(*(value / length for value in quaternion)), translation])

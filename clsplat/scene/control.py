@@ -65,7 +65,7 @@ class MarkedPoint:
         pixels = np.array([mark.pixel for mark in self.marks])
         sizes = [(photo.width, photo.height) for photo in (view.lens or view.camera for view in views)]
         for i in np.flatnonzero(((pixels < 0) | (pixels > sizes)).any(axis=1)):
-            raise DataError(f"point {quote(self.name)}: its mark in {self.marks[i].photo} is not in the photo; fix it")
+            raise DataError(f"point {quote(self.name)}: its mark in {self.marks[i].photo} is outside the photo; fix it")
         if len(views) == 1:
             return self._find_nearest_point(scene, views[0], pixels)
         rays = [_ray(view, pixel) for view, pixel in zip(views, pixels, strict=True)]
@@ -119,7 +119,7 @@ def find_view(scene: Scene, photo: str) -> View:
 
 
 def _ray(view: View, pixel: Floats) -> tuple[Floats, Floats]:
-    """Return the origin and the unit direction of the ray of a pixel, [3] each; NaN where the lens has no inverse."""
+    """Return the origin and the unit direction of the ray of a pixel, [3] each; NaN where undistortion fails."""
     u, v = photo_lens(view).undistort(pixel[:1], pixel[1:])
     direction = view.world_to_camera[:, :3].T @ np.array([u[0], v[0], 1.0])
     return view.position.astype(np.float64), direction / np.linalg.norm(direction)
@@ -140,7 +140,7 @@ def _triangulate(views: Sequence[View], pixels: Floats, rays: Sequence[tuple[Flo
         return np.full(3, np.nan)
     try:
         return np.asarray(scipy.optimize.least_squares(residuals, start, x_scale=np.ptp(centers, axis=0).max()).x)
-    except ValueError:  # a step behind a camera
+    except ValueError:  # a step moved the point behind a camera
         return start
 
 
@@ -283,8 +283,8 @@ class GpsPositions:
 def to_utm(positions: Floats) -> tuple[Floats, int]:
     """Convert latitude, longitude (degrees) and altitude (m), [N, 3], to UTM, in the zone of their median longitude.
 
-    Returns easting, northing, and altitude, [N, 3] m, and the EPSG code.  Krüger's series to the third order is exact
-    to a millimeter.
+    Returns easting, northing, and altitude, [N, 3] m, and the EPSG code.  Krüger's series to the third order is
+    accurate to a millimeter.
     """
     zone = int((np.median(positions[:, 1]) + 180) // 6) % 60 + 1
     is_south = float(np.median(positions[:, 0])) < 0

@@ -52,7 +52,7 @@ def find_reader(path: Path) -> Reader | None:
     return next((reader for reader in readers() if reader.matches(path)), None)
 
 
-MAX_DEPTH = 2  # levels of folders below a scene in which its dataset may be
+MAX_DEPTH = 2  # levels of folders below a scene to search for its dataset
 FALLBACK_DEPTH = 4  # levels to search if there is no dataset up to MAX_DEPTH
 logger = logging.getLogger("clsplat")
 
@@ -130,7 +130,7 @@ def read_scene(path: str | Path, holdout: int | Split = HOLDOUT) -> Scene:
     if any(is_image(file) for file in path.iterdir()):
         parent = next((folder for folder in path.absolute().parents[:2] if find_reader(folder)), None)
         remedy = f"`clsplat run photos --scene {shell_quote(path)}` finds the cameras"
-        remedy = f"the cameras are in {parent}: give that folder" if parent else remedy
+        remedy = f"the cameras are in {parent}: use that folder" if parent else remedy
         raise DataError(f"{path}: photos without cameras; {remedy}{note}")
     formats = ", ".join(f"{reader.name} ({reader.expects})" for reader in readers())
     raise DataError(f"{path}: no dataset found; looked for {formats}{note}")

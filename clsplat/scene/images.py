@@ -90,7 +90,7 @@ def jpeg_segments(head: bytes) -> Iterator[tuple[int, int, int]]:
     offset = 2
     while offset + 9 <= len(head) and head[offset] == 0xFF:
         marker = head[offset + 1]
-        if marker == 0xFF:  # fill
+        if marker == 0xFF:  # fill byte
             offset += 1
             continue
         (length,) = struct.unpack_from(">H", head, offset + 2)
@@ -269,11 +269,11 @@ def _decode(data: bytes, path: Path, flags: int) -> NDArray[Any]:
     return np.asarray(pixels)
 
 
-# Read the camera settings of a photograph: from Exif 2.3 in JPEG files, or from a file next to images without it.
+# Read the camera settings of a photograph: from EXIF 2.3 in JPEG files, or from a file next to images without EXIF.
 
 EXPOSURES_FILE = "exposures.json"  # in a folder of images
 EXIF_IFD = 0x8769  # tag with the offset of the exposure tags
-GPS_IFD, SOUTH, LATITUDE, WEST, LONGITUDE, BELOW, ALTITUDE = 0x8825, 1, 2, 3, 4, 5, 6  # SOUTH, WEST, BELOW: signs
+GPS_IFD, SOUTH, LATITUDE, WEST, LONGITUDE, BELOW, ALTITUDE = 0x8825, 1, 2, 3, 4, 5, 6  # signs: SOUTH, WEST, BELOW
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
 MAKE, MODEL, FOCAL, FOCAL_35 = 0x010F, 0x0110, 0x920A, 0xA405  # mm, and mm equivalent for 35 mm film
 BYTE, TEXT, SHORT, LONG, RATIONAL = 1, 2, 3, 4, 5  # types of values
@@ -296,7 +296,7 @@ class CameraExposure:
 
 
 def read_exif_exposure(path: Path) -> CameraExposure | None:
-    """Return the exposure in the EXIF data of a JPEG file, or None without it.  Raises DataError."""
+    """Return the exposure in the EXIF data of a JPEG file, or None if it is missing.  Raises DataError."""
     tags = _read_tags(path)
     return make_exposure(tags.get(SECONDS), tags.get(APERTURE), tags.get(ISO))
 

@@ -25,12 +25,12 @@ MAX_DEPTH = 6  # levels of folders to search below the folder of the scene
 MAX_COMPARED = 5000  # file names to search for the most similar one
 RESULTS = {STATUS, "record.json", "cfg_args"}  # files that mark folders of runs (ours and 3DGS's) and of `prepare`
 CONVERTED = re.compile(r"\.(heic|heif|avif|jxl|jp2|dng|cr2|cr3|nef|arw|raf|orf|rw2|exr|gif|pgm|ppm)")
-OTHER_CONTENT = re.compile(  # folders whose images are photographs only if the name in the dataset contains the folder
+OTHER_CONTENT = re.compile(  # folders whose images are photographs only if the dataset names them
     r"(?<![a-z])(mask|alpha|depth|normal|segmentation|semantic|label|render|output|thumb|thumbnail|preview)s?(?![a-z])"
 )
-SPLITS = {"train", "test", "val", "validation", "eval"}  # folder names; a photograph in one never matches another
+SPLITS = {"train", "test", "val", "validation", "eval"}  # folder names; a photograph in one matches no name in another
 REDUCED = re.compile(r"(?:images?|input|rgb|photos?|frames)_(\d{1,2})")  # a folder of photographs at 1/N of the size
-OTHER_PROGRAMS = {  # programs whose camera files are not supported, and a pattern in the start of such a file
+OTHER_PROGRAMS = {  # unsupported programs, and a pattern near the start of their camera files
     "Polycam": rb'"t_00"',
     "Record3D": rb'"initPose"|"poses": *\[\[',
     "Metashape": rb"<document[^>]*>\s*<chunk",
@@ -100,7 +100,8 @@ class FileLookup:
 
     The file `folder / name` is used if it exists.  Otherwise, a name and a file below `root` match if each is the only
     best match of the other.  Paths match better if more of their last components are equal.  Case, the kind of slash,
-    Unicode normalization, URL escapes, and the image suffix are ignored; symbolic links that point out of `root`, too.
+    Unicode normalization, URL escapes, and the image suffix do not matter.  Symbolic links that point out of `root`
+    are skipped.
 
     spellings: returns the file names to try first for a name, by default the name itself.  strict: require that
     the entire relative path of the file or of the name matches, as for masks and depth maps.  excluded: files that must
@@ -117,11 +118,11 @@ class FileLookup:
         excluded: Iterable[Path] = (),
     ) -> None:
         self.root, self.folder, self.strict = root, folder, strict
-        self.raw_names, self.names = list(names), list(names)  # as in the dataset, and of the views
+        self.raw_names, self.names = list(names), list(names)  # names in the dataset, and names of the views
         self.paths = [folder / ELSEWHERE / re.sub("[\0-\x1f]", "?", PureWindowsPath(name).name) for name in names]
-        self.matches: dict[int, int] = {}  # length of the common end of the path, by index, of each inexact match
+        self.matches: dict[int, int] = {}  # by index, for inexact matches: number of equal components at the end
         self.downscaled_files: set[Path] = set()  # photographs from a folder such as images_4
-        self.candidates: dict[int, list[Path]] = {}  # files that match a name equally well, by its index
+        self.candidates: dict[int, list[Path]] = {}  # files that match a name equally well, by the index of the name
         unmatched = [i for i in range(len(names)) if not self._use_exact_match(i, spellings)]
         self._match(unmatched, {*excluded} | {*self.paths} - {self.paths[i] for i in unmatched})
         self.skipped = tuple(self.names[i] for i in unmatched if i not in self.matches)
@@ -172,7 +173,7 @@ class FileLookup:
         for i in unmatched:
             candidates_by_rank = defaultdict[tuple[int, ...], list[tuple[PathParts, Path]]](list)
             files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in excluded]
-            siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # longer ends, faster
+            siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # better matches, and faster
             for parts, path in siblings or files:
                 if rank := self._rank(self.raw_names[i], targets[i], parts, path):
                     candidates_by_rank[rank].append((parts, path))
@@ -233,7 +234,7 @@ class FileLookup:
         relative = {path: path.relative_to(self.root) for files in self._files.values() for _, path in files}
         for i, paths in self.candidates.items():
             matching_files = [relative[path].as_posix() for path in paths]
-            return f" ({first_few(matching_files)} fit {quote(self.raw_names[i])} equally well)"
+            return f" ({first_few(matching_files)} match {quote(self.raw_names[i])} equally well)"
         if not relative:
             return f" ({self.root} contains no images)"
         used_paths = {*self.paths}

@@ -28,7 +28,7 @@ MAX_DIFFERENCE = 1.5  # planes between depths that agree
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface in a downscaled photograph, known in pixels where adjacent photographs agree on the depth."""
+    """The surface in a downscaled photograph.  Its depth is known where adjacent photographs agree on it."""
 
     view: View
     image: Floats  # [H, W, 3] float32, in [0, 1]

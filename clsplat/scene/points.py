@@ -59,8 +59,9 @@ class PointTable(NamedTuple):
 def read_points_ply(path: Path, clock: Clock | None = None) -> PointCloud:
     """Read the positions, the colors and, with a clock, the times of the vertices of a PLY file.
 
-    The vertices need the properties x y z and uchar red green blue; others are ignored.  Raises DataError if the file
-    is damaged, is big-endian or lacks these properties, or if the times are in a different unit from the frames' times.
+    The vertices need the properties x y z and uchar red green blue; other properties are ignored.  Raises DataError if
+    the file is damaged, is big-endian or lacks these properties, or if the times are in a different unit from the
+    frames' times.
     """
     return read_ply_table(path).to_point_cloud(clock)
 

@@ -81,7 +81,7 @@ def near_plane(scene: Scene) -> float:
 
 # Sharpness of photographs.
 
-MIN_SHARPNESS = 0.25  # of the median of a set: sharp photographs reach 0.4 or more, a blur of 1 px only 0.05 to 0.09
+MIN_SHARPNESS = 0.25  # times the median of a set; sharp photographs reach 0.4 or more, a blur of 1 px only 0.05 to 0.09
 SIDE = 480  # px: sharpness is measured at this size, since noise looks like detail at full size
 
 

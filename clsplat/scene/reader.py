@@ -52,7 +52,7 @@ class Parts:
             return None
 
     def expect(self, files: FileLookup) -> None:
-        """Add the files that the dataset refers to to `expected_files`, and a note about inexact matches to `notes`."""
+        """Add the files that the dataset names to `expected_files`, and a note about inexact matches to `notes`."""
         self.expected_files += files.paths
         self.notes += [files.note] if files.note else []
         self.hint = files.hint

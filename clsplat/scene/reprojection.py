@@ -12,7 +12,7 @@ from clsplat.scene.view import View, photo_lens
 
 Floats = NDArray[np.float64]
 MAX_ERROR = 1.0  # px at the training resolution (our choice): beyond it, the pixel does not show the point
-EXACT = 1e-3  # px: below it, observations were computed from the cameras and say nothing about them
+EXACT = 1e-3  # px: with smaller errors, observations were computed from the cameras and say nothing about them
 
 
 def reprojection_residuals(view: View, positions: NDArray[np.floating], observations: Floats) -> Floats:
@@ -23,7 +23,7 @@ def reprojection_residuals(view: View, positions: NDArray[np.floating], observat
     """
     original = view.lens or view.camera
     size = np.array([original.width, original.height])
-    is_plausible = np.all(np.abs(observations - size / 2) <= size, axis=1, keepdims=True)  # damaged files have others
+    is_plausible = np.all(np.abs(observations - size / 2) <= size, axis=1, keepdims=True)  # not so in damaged files
     return np.where(is_plausible, observations - project_points(view, positions), np.nan)
 
 

@@ -61,10 +61,10 @@ class Tracks:
 
 Background = Literal["black", "white"]
 HOLDOUT = 8  # every 8th view is a test view if the dataset has no split: the default of pipelines
-MAX_DISTANCE = 10.0  # median distances: evenly spaced cameras on a line reach 2, an orbit 1, a close-up about 4
-MAX_OFFSET = 100  # x the median distance of the points; float32 then places them to 1e-5 of that distance
+MAX_DISTANCE = 10.0  # times the median distance; cameras reach 2 on a line, 1 on an orbit, and about 4 in a close-up
+MAX_OFFSET = 100  # times the median distance of the points; float32 then resolves 1e-5 of that distance
 MAX_OUTLIERS = 0.2  # fraction of the cameras
-ROUNDING = 1e-6  # of the largest coordinate: closer cameras have the same center
+ROUNDING = 1e-6  # times the largest coordinate; centers that differ by less count as equal
 MAX_THUMBNAILS = 4
 IN_MEMORY = Path("<memory>")  # of a scene without a dataset
 SPLITS = ("train", "test", "validation")
@@ -196,7 +196,7 @@ class Scene:
 
     @property
     def cameras(self) -> dict[str, str]:
-        """The name of each view's camera, by view name: that of the first view with an equal lens or camera."""
+        """The camera name of each view, by view name: the name of the first view with an equal lens or camera."""
         first_names: dict[object, str] = {}
         return {view.name: first_names.setdefault(view.lens or view.camera, view.name) for view in self.views}
 

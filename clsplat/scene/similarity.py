@@ -144,7 +144,7 @@ class Correspondences:
 
 
 ROUNDING = 1e-6  # of the spread of the targets: smaller distances are rounding errors
-OUTLIER_DISTANCE = 3.0  # times the median distance; it is 4.6 standard deviations of each coordinate
+OUTLIER_DISTANCE = 3.0  # times the median distance; for normal errors, 4.6 standard deviations of a coordinate
 MAX_SAMPLES = 1000
 MAX_ROUNDS = 20
 Fit = TypeVar("Fit")
@@ -160,7 +160,7 @@ def fit_without_outliers(
     """Return a fit to the inliers among `count` observations, and a mask of the outliers, [count].
 
     The iteration starts at the fit to `minimum` observations with the least median of squares (Rousseeuw 1984).
-    Fewer than minimum + 2 observations are all inliers, because an outlier cannot be distinguished.  floor: the
+    With fewer than minimum + 2 observations, all are inliers, because an outlier cannot be identified.  floor: the
     distance below which no observation is an outlier.
     """
     all_rows = np.arange(count)
@@ -191,7 +191,7 @@ def _samples(count: int, size: int) -> Iterable[NDArray[np.intp]]:
 
 # Level scenes.
 
-UP = np.array([0.0, -1.0, 0.0])  # as in an OpenCV camera; the viewer and other programs assume it for a PLY
+UP = np.array([0.0, -1.0, 0.0])  # as in an OpenCV camera; the viewer and other programs assume it for PLY files
 
 
 def level(

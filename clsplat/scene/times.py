@@ -21,15 +21,16 @@ class Clock:
     def normalize_points(self, path: object, values: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the timestamps of the points of the file `path` as times in [0, 1], in the same shape.
 
-        Raises DataError if some are outside the range of the scene by more than a single-precision rounding error.
+        Raises DataError if some are outside the range of the scene by more than 0.1 % of it or a rounding error.
         """
         span, max_time = self.last - self.first, max(abs(self.first), abs(self.last))
         slack = max(1e-3 * span, float(np.finfo(np.float32).eps) * max_time)
         low, high = (float(values.min()), float(values.max())) if values.size else (self.first, self.last)
         if low < self.first - slack or high > self.last + slack:
             raise DataError(
-                f"{path}: its points have times from {low:.9g} to {high:.9g}, but the frames from {self.first:.9g} to "
-                f"{self.last:.9g}; use the unit of the frames, or remove the property `time` of the points"
+                f"{path}: its points have times from {low:.9g} to {high:.9g}, but the frames have times from "
+                f"{self.first:.9g} to {self.last:.9g}; use the unit of the frames, or remove the property `time` of "
+                "the points"
             )
         return self(values)
 

@@ -36,8 +36,8 @@ def read_times(folder: Path) -> dict[str, float] | None:
     for name, value in table.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_VALUE:
             raise DataError(
-                f"{path}: the time of {quote(name)} is {quote(value)}; expected {BELOW_MAX}: write all times in "
-                "a larger unit"
+                f"{path}: the time of {quote(name)} is {quote(value)}; expected {BELOW_MAX}: fix it, or write "
+                "all times in a larger unit"
             )
     return {name: float(value) for name, value in table.items()}
 

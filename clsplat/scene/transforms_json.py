@@ -191,7 +191,7 @@ def list_frames(parts: Parts, root: Path, *names: str) -> None:
         exists = [os.path.isfile(path) for path in lookup.paths]
         parts.attempt(lookup.find_masks, parts.path, np.flatnonzero(exists).tolist())
         for i, frame in enumerate(lookup.frames):
-            has_size = exists[i] or (frame.value("w") and frame.value("h"))  # otherwise, the missing file is the fault
+            has_size = exists[i] or (frame.value("w") and frame.value("h"))  # otherwise, only the file is a fault
             parts.views += filter(None, [parts.attempt(lookup.make_view, i, clock) if has_size else None])
     if files and files[0]:
         path = parts.attempt(files[0].points_path)
@@ -429,7 +429,7 @@ def _read_frames(path: Path, splits: Any, name: str) -> list[JsonFrame]:
     if not all(isinstance(column, list) for column in columns) or len(set(map(len, columns))) > 1:
         raise DataError(f"{path}: '{name}' needs lists of equal length named {', '.join(COLUMNS)}; create it again")
     if len(columns[0]) > MAX_FRAMES:
-        raise DataError(f"{path}: '{name}' has {len(columns[0])} images; expected at most {MAX_FRAMES}")
+        raise DataError(f"{path}: '{name}' has {len(columns[0])} images; expected at most {MAX_FRAMES}: split it")
     frames = []
     for i, (file, pose, width, height, focal, label) in enumerate(zip(*columns, strict=True)):
         values = {"file_path": file, "transform_matrix": pose, "w": width, "h": height, "fl_x": focal, "label": label}

@@ -76,8 +76,8 @@ class View:
     time: float | None = None  # timestamp in [0, 1]; None: the scene is static
     static_path: Path | None = None  # an image of the photograph's size, white in pixels without motion
     camera_to_world: Floats | None = None  # [4, 4] float64, as in the file; None after make_scene
-    response: Callable[..., Any] | None = None  # (workspace, camera, planes) -> planes with the camera response
-    image: NDArray[Any] | None = None  # [height, width, 3 or 4], integers or [0, 1]: the photograph instead of a file
+    response: Callable[..., Any] | None = None  # (workspace, camera, planes) -> planes after the camera response
+    image: NDArray[Any] | None = None  # [height, width, 3 or 4], integers or in [0, 1]: a photograph in memory
     background: tuple[float, float, float] = BLACK  # color of the scene behind transparent pixels
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class View:
         right = np.cross(forward, up_vector)
         axes = np.stack([right, np.cross(forward, right), forward])
         if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward) * np.linalg.norm(up_vector):
-            raise ValueError(f"{quote(name)}: expected a target other than the position, not in the direction of `up`")
+            raise ValueError(f"{quote(name)}: expected a target away from the position, not in the direction of `up`")
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
         return cls(name, camera, np.column_stack([axes, -axes @ center]))
 
@@ -194,7 +194,7 @@ def _validate_pixels(name: str, image: ArrayLike) -> NDArray[Any]:
             f"the image of {quote(name)} has values of type {pixels.dtype}, or outside of [0, 1]; expected uint8, "
             "uint16, or floats from 0 to 1"
         )
-    return np.asarray(np.rint(pixels.astype(np.float64) * 65535), np.uint16)  # uint8 / 255 is exact
+    return np.asarray(np.rint(pixels.astype(np.float64) * 65535), np.uint16)  # exact for uint8 / 255
 
 
 CUBE = "cube_"  # prefix of the name of a face
@@ -247,7 +247,7 @@ def load_image(view: View, background: tuple[float, float, float] | Floats = BLA
 def load_rgba(view: View) -> NDArray[np.uint8] | None:
     """Return the photograph of `view` at the size of its camera with straight alpha, [H, W, 4].
 
-    None when it has no alpha, or when the view has a mask.  Raises DataError like load_image.
+    Returns None if the photograph has no alpha, or if the view has a mask.  Raises DataError like load_image.
     """
     pixels = _read_original(view, view.image_path)
     if pixels.shape[2] == 3 or load_mask(view) is not None:
@@ -260,7 +260,7 @@ def load_rgba(view: View) -> NDArray[np.uint8] | None:
 def load_transparency(view: View) -> NDArray[np.uint8] | None:
     """Return the transparency of the photograph of `view`, [H, W], from 0 (opaque) to 255.
 
-    None when it is opaque or has a mask.  Raises DataError like load_image.
+    Returns None if the photograph is opaque or has a mask.  Raises DataError like load_image.
     """
     rgba = load_rgba(view)
     return None if rgba is None or (rgba[:, :, 3] == 255).all() else np.asarray(255 - rgba[:, :, 3])
@@ -329,7 +329,7 @@ def needs_rotation(view: View, path: Path, read_size: Callable[[bool], Size]) ->
 
 
 def fit_to_photograph(view: View) -> View:
-    """Return the view with its camera scaled to its photograph if that is smaller and has the same aspect ratio."""
+    """Return the view, with its camera scaled down if its photograph is smaller but has the same aspect ratio."""
     (width, height), camera = read_stored_size(view.image_path), view.lens or view.camera
     x_scale, y_scale = width / camera.width, height / camera.height
     if x_scale >= 1 or abs(height - x_scale * camera.height) > MAX_ROUNDING:

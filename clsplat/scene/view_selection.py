@@ -208,7 +208,7 @@ def _unknown_name_error(name: str, names: Sequence[str], source: str) -> DataErr
 
 # Split a scene into training, validation and test views.
 
-FOLD, FOLD_OFFSET = 8, 4  # every 8th training view by name, without the first, where a camera path often ends
+FOLD, FOLD_OFFSET = 8, 4  # every 8th training view by name from the 5th on: a camera path often starts at the first
 MIN_TRAIN = 4  # smallest number of training views from which some can be held out for validation
 
 
@@ -293,7 +293,7 @@ class Split:
     def with_validation(self, scene: Scene, omitted_names: Sequence[str] = ()) -> Scene:
         """Return the scene with some of its training views moved to the validation views.
 
-        omitted_names: names of views that are not in the scene because of `train`.  Raises the errors of `apply`.
+        omitted_names: names of views that are not in the scene because of `train`.  Raises DataError like `apply`.
         """
         folders = [scene.path, *([self.folder] if self.folder else [])]
         if self.validation == 0:

@@ -13,17 +13,17 @@ from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import View
 
 MIN_TURN = 0.1  # smallest second eigenvalue of the right axes of cameras that turn enough: 18 degrees
-MAX_ROLL = 0.15  # largest ratio of the third to the second eigenvalue of level cameras
-MIN_UP = 0.2  # smallest component of the mean up axis along the axis that determines its sign
+MAX_ROLL = 0.15  # largest ratio of the smallest to the second eigenvalue for level cameras
+MIN_UP = 0.2  # smallest component of the mean up axis that determines the sign of the up direction
 MIN_AGREEMENT, MAX_TILT = 0.5, 75.0  # a mean up axis longer than MIN_AGREEMENT is at most MAX_TILT degrees off
 PRIOR = 1e-3  # weight of the center of the splats, which determines the distance if all axes are parallel
 START_CAMERA = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a scene without views
 QUANTILES = 0.05, 0.95  # of the splats along each axis: the faces of the box to look at
 DISTANCE = 2.2  # of the start view from the center of the box, divided by half the diagonal of the box
 TOWARD_START = np.array([0.35, -0.25, -0.9])  # from the center
-NO_GROUND = "omit --level, or level by the cameras of a scene with `clsplat align`"
+NO_GROUND = "omit --level, or level the scene by its cameras with `clsplat align`"
 VISIBLE_FRACTION, MARGIN = 0.999, 1.05  # of the splats in the start view, and the space around them
-MAX_ZOOM_OUT = 2.0  # times the distance; splats that need more have a background, which may be outside the image
+MAX_ZOOM_OUT = 2.0  # times the usual distance; splats that need more have a background, which may be outside the image
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Create points from photographs with transparency: the visual hull of their silhouettes (Laurentini 1994).
 
 A box is split into cells, as an octree (Szeliski 1993).  A cell outside the silhouette in at least one view is empty,
-and a cell inside all silhouettes is full; the others are split.  Cells of the last level are full if their centers are.
+and a cell inside all silhouettes is full; the others are split.  Cells of the last level are full if their centers are
+inside all silhouettes.
 """
 
 import math

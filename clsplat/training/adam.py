@@ -136,8 +136,8 @@ class Adam:
         """Update all parameters from the frame's sums over pixels, [PIXEL_SUMS, S].
 
         Returns the gradient of the projected means, [2, S] px⁻¹, which is valid until the next update.
-        statistics: the statistics to add to, see `SplatStats.update_arguments`; without them, only this gradient is
-        written.
+        statistics: the result of `SplatStats.update_arguments`, to add the view to these statistics; without it, only
+        this gradient is written.
         """
         gaussians, rows, grad_mean2d = self.gaussians, self._effective_rows(rows), self._mean2d()
         sums = {"pixel_sums": pixel_sums, "has_pairs": 0} if isinstance(pixel_sums, Array) else pixel_sums.arguments()

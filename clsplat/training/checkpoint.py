@@ -51,7 +51,7 @@ from clsplat.training.sh_offload import make_room
 
 # The metadata of a checkpoint contains the state of a run without its tables.
 
-MAX_VALUE = 10**15  # larger counts and seconds are damage; float64 represents all smaller integers
+MAX_VALUE = 10**15  # larger counts and seconds mean damage; float64 represents all smaller integers
 Count = Annotated[int, Field(ge=0, le=MAX_VALUE)]
 Seconds = Annotated[float, Field(ge=0, le=MAX_VALUE)]
 Metrics = dict[str, dict[str, dict[str, Any]]]  # averages by split and downscale factor
@@ -77,7 +77,7 @@ class State(BaseModel):
     modules: dict[str, dict[str, float]]  # scalars of training modules, by type
     best: Best | None  # the best model by validation
     train_seconds: Seconds
-    cpu_seconds: Seconds  # in the same time
+    cpu_seconds: Seconds  # of all threads, in the same time
     metrics: Metrics
     records: Count  # lines of metrics.jsonl
     model_hashes: dict[str, str]  # SHA-256 of model files, by path in the run folder
@@ -307,8 +307,8 @@ def save_failed(run: Run, broken: list[str]) -> str:
     checkpoints = list_files(run.out)
     return (
         f"parameters not finite: {', '.join(broken) or 'none'}; {state}; "
-        f"`clsplat resume {shell_quote(run.out)} --set {suggest_rate(run, broken)}` lowers a rate and "
-        f"{f'resumes from {checkpoints[-1].name}' if checkpoints else 'starts over'}"
+        f"run `clsplat resume {shell_quote(run.out)} --set {suggest_rate(run, broken)}` to lower a learning rate and "
+        f"{f'resume from {checkpoints[-1].name}' if checkpoints else 'start over'}"
     )
 
 
@@ -378,9 +378,9 @@ def restore(run: Run) -> tuple[Path | None, list[str]]:
             LOG.warning("%s is damaged (%s); using an earlier one", path, error)
             continue
         changes = _record_changes(run, path, state)
-        remarks = [f"{text}; from here on, bits differ from a run without this change" for text in changes]
+        remarks = [f"{text}; from here on, results differ from those without this change" for text in changes]
         if state.device != run.device.label:
-            remarks.append(f"the run was started on {state.device}; from here on, bits may differ")
+            remarks.append(f"the run was started on {state.device}; from here on, results may not be bit-identical")
         _restore(run, state, tables)
         return path, remarks
     if last := run.status.now.checkpoint:

@@ -184,7 +184,7 @@ def read_clocks() -> tuple[float, float]:
 
 PSNR_REPORTS = 5  # reports over which PSNR is averaged
 TIME_REPORTS = 3  # reports over which step time is averaged
-GROWTH_REPORTS = 4  # reports from which growth is extrapolated
+GROWTH_REPORTS = 4  # latest reports from which growth is extrapolated
 MIN_RATIO = 2.0  # smallest ratio of two Gaussian counts from which the cost of a Gaussian can be fitted
 DEFAULT_COST = 0.6  # time of an additional Gaussian, relative to the mean, if it cannot be fitted
 MIN_COST = 0.4  # lower bound of the fitted cost, relative to the mean; fits are unreliable on a busy machine

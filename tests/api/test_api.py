@@ -111,7 +111,7 @@ def test_view_looking_at_a_point_centers_it_with_up_upwards(rng):
 @pytest.mark.parametrize(
     ("place", "message"),
     [
-        (([1, 2, 3], [1, 2, 3], [0, 0, 1]), "expected a target other than the position"),
+        (([1, 2, 3], [1, 2, 3], [0, 0, 1]), "expected a target away from the position"),
         (([0, 0, 0], [0, 0, 5], [0, 0, 1]), "not in the direction of `up`"),
         (([0, 0], [0, 0, 5], [0, 1, 0]), "of 3 numbers each"),
     ],
@@ -254,7 +254,7 @@ def test_view_of_size_zero_is_refused(downscale):
 @pytest.mark.parametrize("changes", [{"width": 50.5}, {"height": 32.0}])
 def test_fractional_image_size_is_refused(changes, device, rng):
     view = clsplat.View("front", replace(CAMERA, **changes), np.eye(3, 4))
-    with pytest.raises(ValueError, match=r"^the camera is .*; expected integers"):
+    with pytest.raises(ValueError, match=r"^the camera is .*; expected an integer width and height"):
         Renderer(model_of(random_case(rng, 5)), device).render(view)
 
 

@@ -200,7 +200,7 @@ def test_invalid_option_is_refused_before_writing(option, text, source, tmp_path
             r"b\.glb: --quality is only for SPZ and SOG; use a name that ends in \.spz or ",
         ),
         ("b.compressed.ply", {}, "compressed PLY can be read but not written"),
-        ("b.xyz", {}, r"no format has the name 'b.xyz'; use a name that ends in \.ply, "),
+        ("b.xyz", {}, r"no format matches the name 'b.xyz'; use a name that ends in \.ply, "),
         ("b.ply", {"sh_degree": 4}, "expected 0 to 3"),
         ("b.spz", {"quality": "best"}, "--quality 'best': expected one of small, balanced, high"),
     ],

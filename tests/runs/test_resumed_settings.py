@@ -31,7 +31,7 @@ def test_settings_without_effect_on_tables_may_change(killed_run, tiny_scene, fe
 def test_training_values_may_change(change, killed_run, tiny_scene, caplog):
     run = train(tiny_scene, killed_run, *FEW, change, resume=True)
     assert run.step == (14 if "steps" in change else 12)
-    assert caplog.text.count("from here on, bits differ from a run without this change") == 1
+    assert caplog.text.count("from here on, results differ from those without this change") == 1
     assert len(json.loads((killed_run / "metrics.json").read_text())["changes"]) == 1
     assert f"{change.split('=')[1]}" in (killed_run / "pipeline.yaml").read_text()
 

@@ -206,7 +206,7 @@ def test_unwritable_output_is_refused(scene_of, tmp_path):
         clsplat.write_cameras(scene, tmp_path / "out", images="link")
     view = View("two\nlines", scene.views[0].camera, scene.views[0].world_to_camera)
     alone = make_scene(tmp_path, [view], set(), None)
-    with pytest.raises(DataError, match="a name on a single line"):
+    with pytest.raises(DataError, match="remove spaces at its ends and line breaks"):
         clsplat.write_cameras(alone, tmp_path / "out")
     nameless = make_scene(tmp_path, [View("a", view.camera, view.world_to_camera)], set(), None)
     with pytest.raises(DataError, match="has no photo to copy"):

@@ -89,9 +89,9 @@ def test_moved_photographs_are_matched_by_path(tmp_path: Path, caplog: pytest.Lo
 
 
 REFUSALS = {  # the kind of dataset, its names, the files on disk, and what is said
-    "two fit": ("colmap", ["a.tif"], ["images/a.jpg", "images/a.png"], "images/a.jpg, images/a.png fit 'a.tif'"),
-    "only case differs": ("colmap", ["Aa.jpg"], ["images/aA.jpg", "images/aa.jpg"], "fit 'Aa.jpg' equally well"),
-    "two folders": (JSON, ["rgb/a.jpg"], ["x/a.jpg", "y/a.jpg"], "x/a.jpg, y/a.jpg fit 'rgb/a.jpg' equally well"),
+    "two fit": ("colmap", ["a.tif"], ["images/a.jpg", "images/a.png"], "images/a.jpg, images/a.png match 'a.tif'"),
+    "only case differs": ("colmap", ["Aa.jpg"], ["images/aA.jpg", "images/aa.jpg"], "match 'Aa.jpg' equally well"),
+    "two folders": (JSON, ["rgb/a.jpg"], ["x/a.jpg", "y/a.jpg"], "x/a.jpg, y/a.jpg match 'rgb/a.jpg' equally well"),
     "two names": (JSON, ["l/a.jpg", "r/a.jpg"], ["images/a.jpg"], "2 of 2 image files are missing"),
     "another camera": ("colmap", ["l/a.jpg", "r/a.jpg"], ["images/l/a.jpg", "x/a.jpg"], "1 of 2 image files are miss"),
     "a mask": (JSON, ["images/a.jpg"], ["masks/a.jpg"], "1 of 1 image files are missing"),
@@ -255,7 +255,7 @@ def test_only_photograph_is_trained_on_without_holdout(tmp_path: Path) -> None:
 
 def test_parent_folder_with_cameras_is_named(tmp_path: Path) -> None:
     scene = made(tmp_path, "colmap", ["a.jpg"], ["images/a.jpg"])
-    assert f"the cameras are in {scene}: give that folder" in refusal(read_scene, scene / "images")
+    assert f"the cameras are in {scene}: use that folder" in refusal(read_scene, scene / "images")
 
 
 def test_depth_maps_are_matched_by_name(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ def test_pose_accepts_a_quaternion_of_any_length():
     ],
 )
 def test_invalid_pose_is_refused(quaternion, translation):
-    with pytest.raises(ValueError, match="expected finite numbers and a rotation"):
+    with pytest.raises(ValueError, match="expected finite numbers and a quaternion that is not zero"):
         pose_matrix(quaternion, translation)
 
 

@@ -57,7 +57,7 @@ def test_unremovable_failed_state_does_not_hide_the_advice(run, locked_names):
     locked_names.add("failed_000000.npz")
     (run.out / "checkpoints" / "failed_000000.npz").touch()
     run.model.gaussians["means"].fill(np.nan)
-    with pytest.raises(NotFiniteError, match=r"the state is in .*failed_000002.npz; .*resumes from step_000001.npz"):
+    with pytest.raises(NotFiniteError, match=r"the state is in .*failed_000002.npz; .*resume from step_000001.npz"):
         checkpoint.save(run)
 
 

@@ -47,7 +47,7 @@ def test_nonfinite_state_is_never_a_checkpoint(step, log_every, tiny_scene, tmp_
     assert len(steps_saved(out)) == 2
     assert steps_saved(out)[0].startswith("failed_")
     assert steps_saved(out)[1] == "step_000004.npz"
-    command = re.search(r"`clsplat resume (\S+) --set (\S+)` .*resumes from step_000004.npz", str(error.value))
+    command = re.search(r"`clsplat resume (\S+) --set (\S+)` .*resume from step_000004.npz", str(error.value))
     assert command
     with pytest.raises(NumericError):  # and again, however often
         train(tiny_scene, out, *settings, resume=True)
@@ -60,7 +60,7 @@ def test_nonfinite_state_is_never_a_checkpoint(step, log_every, tiny_scene, tmp_
 def test_nonfinite_loss_leaves_no_newer_checkpoint(tiny_scene, tmp_path, monkeypatch):
     numbers = SimpleNamespace(isfinite=lambda value: False)
     monkeypatch.setattr("clsplat.training.checkpoint.math", numbers)
-    with pytest.raises(NumericError, match=r"parameters not finite: none; .*resumes from step_000004.npz"):
+    with pytest.raises(NumericError, match=r"parameters not finite: none; .*resume from step_000004.npz"):
         train(tiny_scene, tmp_path, *FEW)
     assert steps_saved(tmp_path) == ["failed_000005.npz", "step_000004.npz"]
 
@@ -73,7 +73,7 @@ def test_advice_after_a_nonfinite_state_works(tiny_scene, tmp_path, caplog):
     assert advice, str(error.value)
     train(tiny_scene, tmp_path, *settings, advice[1], resume=True)
     assert "step 4: stages[1].optimize.rates.sh_base was " in caplog.text
-    assert "from here on, bits differ from a run without this change" in caplog.text
+    assert "from here on, results differ from those without this change" in caplog.text
     changes = json.loads((tmp_path / "metrics.json").read_text())["changes"]
     assert len(changes) == 1
     assert changes[0].startswith("step 4: stages[1].optimize.rates.sh_base was ")
