@@ -27,7 +27,7 @@ class _Render(torch.autograd.Function):
         tables: dict[str, Any] = {n: t.detach().cpu().numpy() for n, t in zip(PARAMETERS, tensors, strict=True)}
         model, count = renderer.model, len(tables["means"])
         if model.motion is not None:
-            raise ValueError("gradients of moving models are not supported; use a renderer of `model.at(time)`")
+            raise ValueError("gradients of dynamic models are not supported; use a renderer of `model.at(time)`")
         if model.filter_variance is not None and count != len(model):
             raise ValueError(
                 f"the renderer's model has a world filter for {len(model)} Gaussians, but the parameters have {count}; "
@@ -35,7 +35,7 @@ class _Render(torch.autograd.Function):
             )
         renderer.update(replace(model, **tables))
         ctx.result = renderer.render(view, background)
-        ctx.save_for_backward(*tensors)  # so that torch refuses backward if a tensor was changed in place
+        ctx.save_for_backward(*tensors)  # so that backward raises an error if a tensor was changed in place
         image, alpha = (torch.from_numpy(a.copy()) for a in (ctx.result.image, ctx.result.alpha))
         return image.to(tensors[0].device), alpha.to(tensors[0].device)
 
@@ -58,7 +58,7 @@ def render(
     background: as for `Renderer.render`
 
     The number of Gaussians may change between calls, unless the renderer's model has a `filter_variance`.
-    Raises KeyError for a missing table, and ValueError for a wrong shape or a moving model.
+    Raises KeyError for a missing table, and ValueError for a wrong shape or a dynamic model.
     """
     apply: Any = _Render.apply
     image, alpha = apply(renderer, view, background, *(parameters[name] for name in PARAMETERS))

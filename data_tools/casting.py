@@ -20,7 +20,7 @@ SURFACE_OFFSET = 1e-6  # scene units: secondary rays start this far above the su
 # Light: one jittered shadow ray and one sky ray per sample; a pixel's grid x grid samples share the work.
 KEY_DIRECTION = normalize(np.array([[0.45], [-0.62], [0.95]]))
 KEY_LIGHT = np.array([[1.0], [0.95], [0.86]])
-KEY_WIDTH = 0.11  # radius of the light, as a fraction of its distance
+KEY_WIDTH = 0.11  # radius of the key light, as a fraction of its distance
 SKY_LIGHT = np.array([[0.36], [0.41], [0.50]])
 BOUNCE = 0.45  # light on a shape that blocks the sky, as a fraction of the blocked skylight
 
@@ -47,7 +47,7 @@ class World:
     def by_shape(self, method: Callable[[Shape, Array], Array], index: NDArray[np.intp], points: Array) -> Array:
         """Evaluate `Shape.normal` or `Shape.texture` at surface points, [3, R].
 
-        index: for each point, the index of its shape in `shapes`, [R]
+        index: the index in `shapes` of each point's shape, [R]
         """
         out = np.zeros(points.shape)
         for i in np.unique(index):
@@ -58,11 +58,11 @@ class World:
     def shade(self, points: Array, index: NDArray[np.intp], sample: int) -> Array:
         """Return the light that leaves surface points, [3, R], computed with one shadow ray and one sky ray per point.
 
-        index: for each point, the index of its shape, [R]
+        index: the index in `shapes` of each point's shape, [R]
         sample: the index of the sample in its pixel, which selects the directions of these rays
         """
         count = self.grid * self.grid
-        # far apart in neighboring samples
+        # so that the directions of neighboring samples are far apart
         key_sample, sky_sample = disc(count)[:, [sample * 7 % count, sample * 5 % count]].T
         normal = self.by_shape(Shape.normal, index, points)
         start = points + SURFACE_OFFSET * normal

@@ -38,7 +38,7 @@ class WebArchive:
 SOURCES = {
     "mipnerf360": WebArchive(
         "http://storage.googleapis.com/gresearch/refraw360/360_v2.zip",
-        "Mip-NeRF 360 (Barron et al. 2022); no license is stated: for research",
+        "Mip-NeRF 360 (Barron et al. 2022); no license is stated; for research use",
     ),
     "tandt_db": WebArchive(
         "https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip",

@@ -29,7 +29,7 @@ Net = Literal["vgg", "alex"]
 Field = tuple[int, int | str | bytes]  # number and value of a field of a protobuf message
 Weights = dict[str, NDArray[np.float32]]  # by layer, convolution, and "kernel" or "bias", separated by slashes
 
-# For each network: the file of its weights, the key of its convolutions, the window size of max pooling, its layers:
+# For each network: the file of its weights, the key of its convolutions, the window of max pooling, and its layers.
 # c is a convolution with ReLU, p is max pooling with stride 2, and | marks where features are compared.
 ARCHITECTURES: dict[Net, tuple[str, str, int, str]] = {
     "vgg": ("vgg16", "VGG16_0", 2, "cc|pcc|pccc|pccc|pccc|"),

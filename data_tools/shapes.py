@@ -26,12 +26,12 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def rotate(matrix: Array, v: Array) -> Array:
-    """Multiply columns [3, R] by a [3, 3] matrix.  BLAS is not used, because its rounding may depend on threads."""
+    """Multiply columns [3, R] by a [3, 3] matrix, without BLAS, whose rounding may depend on the number of threads."""
     return np.asarray(matrix[:, :1] * v[0] + matrix[:, 1:2] * v[1] + matrix[:, 2:] * v[2])
 
 
 def normalize(v: Array) -> Array:
-    """Scale columns to unit length."""
+    """Scale the columns of an array [3, R] to unit length."""
     return np.asarray(v / np.sqrt(dot(v, v)))
 
 
@@ -143,7 +143,7 @@ class Shape:
 
 @dataclass(frozen=True, kw_only=True)
 class Sphere(Shape):
-    """A sphere."""
+    """A sphere with the given radius, in scene units."""
 
     radius: float
 
@@ -178,7 +178,7 @@ class Cuboid(Shape):
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Shape):
-    """A closed cylinder along the local z axis."""
+    """A closed cylinder along the local z axis with half height `half`."""
 
     radius: float
     half: float

@@ -153,7 +153,7 @@ def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> 
 def surface_points(
     world: World, pose: Array, image: NDArray[np.uint8], count: int, noise: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return the positions and colors of noisy surface points in a view, both [M, 3], as from structure from motion.
+    """Return positions and colors of noisy surface points in a view, both [M, 3], like points of structure from motion.
 
     count: number of rays through opaque pixels; M is smaller if rays miss
     noise: standard deviation of each coordinate, scene units

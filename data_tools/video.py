@@ -28,7 +28,7 @@ STILL = 0.1  # px per frame: smaller motion is noise or compression artifacts
 
 
 def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | None = None, times: bool = False) -> int:
-    """Split a video into `frames` parts of equal motion and write the sharpest frame of each.  Return their number.
+    """Split a video into `frames` parts of equal motion, write the sharpest frame of each, and return their number.
 
     long_side: the maximum width and height of the images, px
     times: whether to also write times.json with the index of each frame in the video, for a dynamic scene
@@ -47,7 +47,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
         if len(sharpnesses) == 1:
             raise DataError(f"{video}: has only one frame; use a photo directly, without `clsplat data video`")
         frame_indices = sharpest(sharpnesses, motions, frames)
-        LOG.info("%d frames, of which %d are written", len(sharpnesses), len(frame_indices))
+        LOG.info("%d frames in the video; writing %d of them", len(sharpnesses), len(frame_indices))
         write_text(out / RECORD, json.dumps({**settings, "chosen": frame_indices}) + "\n")
     files = {index: _file(out, i) for i, index in enumerate(frame_indices, 1)}
     counter = ItemCounter("frames written", len(files))
@@ -65,7 +65,7 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
 
 
 def _read_frame_indices(out: Path, settings: dict[str, Any]) -> list[int] | None:
-    """Return the frame indices that an earlier call with the same settings chose, or None without such a call.
+    """Return the frame indices that an earlier call with the same settings chose, or None if there was no such call.
 
     Raises DataError if the folder contains frames of another video or of other settings, or other images.
     """

@@ -43,7 +43,7 @@ def run(
     start: "resume" continues from the newest checkpoint in `out`, if there is one; "restart" removes the checkpoints
         and metrics of an existing run in `out` and starts over
     live: port of a web page on this machine that shows the model while it trains; 0 selects the default port
-    minutes: choose the number of steps so that the run takes this many minutes, from the start of reading the photos
+    minutes: choose the number of steps so that the run takes this many minutes, including the reading of the photos
     on: an execution file, which specifies where the cells of a matrix run; it replaces the matrix's `execution`
     """
     return run_job(_job(pipeline, scene, out, set, start, on), device, live, minutes)
@@ -101,9 +101,9 @@ def status(folder: PathLike) -> dict[str, Any]:
     """Return the state of a run or a matrix from its files.
 
     A run has the keys of status.json, its last report as `last`, and its `metrics`.  A matrix has `cells`, `done`, and
-    `failed` instead of a step.  An unfinished run also has `silent`, the seconds since its last heartbeat, and `ahead`,
-    the seconds by which that heartbeat is in the future, if at least 60.  Its state is "killed" if
-    the process no longer exists.  `advice` says how to continue.
+    `failed` instead of a step.  An unfinished run also has `silent`, the seconds since its last heartbeat.  If clocks
+    differ and the heartbeat is at least 60 s in the future, `ahead` is the difference in seconds.  The state of a run
+    is "killed" if its process no longer exists.  `advice` says how to continue.
 
     A store has `cells`, the `counts` of cells by state, and `events`.  A scene that is trained in blocks has
     `state` and `parts`.
@@ -223,7 +223,7 @@ def run_job(job: "Job", device: "str | Device | None", live: int | None = None, 
         job.run(device, live, minutes)
         return job.out
     if live is not None or minutes is not None:
-        raise ConfigError("--live and --minutes are for single runs; the cells of a store run in other processes")
+        raise ConfigError("--live and --minutes are for single runs; omit them for a matrix with a store")
     if isinstance(device, Device):
         raise ConfigError("device: expected a name, because the cells of a store run in other processes")
     if device is not None and experiment.execution.has_workers:
@@ -317,11 +317,11 @@ def write_mesh(
     file: a .ply, .obj, or .glb file
     voxel: the edge length of a voxel, in scene units; default: 1.2 pixels at the median depth
     keep: reduce the mesh to this fraction of its faces; this requires the extra `mesh`
-    collision: write a hull for collisions instead, the closed surface around all space that no two views see as free;
-        the default voxel is then twice as large
+    collision: write a collision mesh instead: the closed surface around all space that fewer than two views see as
+        empty; the default voxel is then twice as large
 
     Returns `file`, `bytes`, the numbers of `vertices` and `faces`, the `voxel`, and whether the surface is `closed`.
-    Raises DataError for a moving model, a field, or a model without an opaque surface.
+    Raises DataError for a dynamic model, a field, or a model without an opaque surface.
     """
     from clsplat.workflows import mesh
 
@@ -466,18 +466,18 @@ def convert(
     world: bool = False,
     collider: PathLike | None = None,
 ) -> dict[str, Any]:
-    """Merge models into one file, whose suffix selects the format.  Return `format`, `gaussians`, and `bytes`.
+    """Merge models into one file, whose suffix selects the format.  Gaussians with invalid values are dropped.
 
-    The suffix .html writes a viewer page without a scene.  Gaussians with invalid values are dropped.
+    The suffix .html writes a viewer page without a scene.  Returns `file`, `format`, `gaussians`, and `bytes`.
 
     crop: x0, y0, z0, x1, y1, z1 in world coordinates, after `transform`
     transform: such as "scale=2 rotate=90,0,0" (degrees)
     drop_below: drop Gaussians with a lower opacity
     filter_floaters: drop Gaussians that are large and faint, isolated, or far outside the scene; needs no photos
-    level: turn the model so that its ground is at y = 0 and up is -y; the ground must be within 45 degrees of level
+    level: move the model so that its ground is at y = 0 and -y points up; the ground must be within 45° of level
     splats: merge neighbors until this number of Gaussians remains, not counting the sky
     sky: "splats" writes a learned sky as distant Gaussians, "none" removes it; default: leave it as it is
-    time: write a moving model as a static model at this time, in [0, 1]
+    time: write a dynamic model as a static model at this time, in [0, 1]
     frames: write this number of static files at evenly spaced times: PLY files in the folder `out`, or files named
         `out` with a number added
     world: write world coordinates, not coordinates relative to an origin
@@ -547,7 +547,7 @@ def align(
 
 
 def compare_runs(runs: Sequence[PathLike], out: PathLike = "compare.html", published: PathLike | None = None) -> int:
-    """Write a page that compares runs; return the number of runs.  A matrix folder counts as all of its finished runs.
+    """Write a page that compares runs; return the number of runs.  A matrix folder stands for all its finished runs.
 
     published: a YAML file of published metrics, which are shown in a separate table
     """

@@ -42,7 +42,7 @@ def open_checked(device: str | Device | None, schedule: Schedule = "auto", sort:
 
 
 def default_device(schedule: Schedule = "auto") -> Device:
-    """Return the default device, which is opened at the first call."""
+    """Return the default device, which the first call opens."""
     with _OPEN_LOCK:  # all threads must get the same device
         return _open_default(schedule)
 
@@ -65,8 +65,8 @@ class Gradients:
     mean2d: Floats  # [N, 2] px⁻¹, with respect to the projected mean
     rotation: NDArray[np.float64]  # [3] rad⁻¹; camera coordinates p become exp([rotation]x) p + translation
     translation: NDArray[np.float64]  # [3] 1 / scene units, in camera axes
-    log_focal: float  # with respect to the logarithm of a factor on both focal lengths
-    motion: Floats | None = None  # [N, 5 or more] if the Gaussians move
+    log_focal: float  # with respect to the logarithm of a factor that scales both focal lengths
+    motion: Floats | None = None  # [N, 5 or more] for a dynamic model
 
     def __repr__(self) -> str:
         return f"Gradients(of {len(self.means):,} Gaussians)"
@@ -79,7 +79,7 @@ class RenderResult:
     image: Floats  # [height, width, 3], over the background
     alpha: Floats  # [height, width] in [0, 1], opacity of each pixel
     depth: Floats | None  # [height, width] scene units, mean depth of each pixel; 0 where alpha is 0
-    median_depth: Floats | None  # [height, width] scene units, where transmittance falls below ½; 0 if it does not
+    median_depth: Floats | None  # [height, width] scene units, where transmittance falls below ½; 0 if it stays above
     view: View
     background: Floats  # [3]
     model: DeviceModel  # the rendered model, which stays on the device as long as this result
@@ -95,7 +95,7 @@ class RenderResult:
         depth: dL/d depth, [height, width] in 1 / scene units; it is ignored where alpha is 0
 
         This method can be called repeatedly, even after `Renderer.update`: the gradients are always those of the
-        rendered model.  Raises ValueError for arrays of the wrong shape, and for `depth` if the model moves; use a
+        rendered model.  Raises ValueError for arrays of the wrong shape, and for `depth` if the model is dynamic; use a
         renderer of `model.at(time)` instead.
         """
         return self.renderer.backward(self, image, alpha, depth)
@@ -156,7 +156,7 @@ class Renderer:
 
     @serialized
     def render(self, view: View, background: Color | None = None, depth: bool = False) -> RenderResult:
-        """Render a view.  A moving model is rendered at the time of the view.
+        """Render a view.  A dynamic model is rendered at the time of the view.
 
         background: a color in [0, 1], as one number or three; default: the model's sky or background, or black
         depth: also render the mean and the median depth, which requires a second pass
@@ -192,7 +192,7 @@ class Renderer:
         if alpha is not None or depth is not None:
             frame = self._forward(model, camera, np.zeros(3, np.float32), "depth")
             geometry = self._pixel_sums(model, frame, _depth_planes(frame, alpha, depth)).get()
-            grad_depth += geometry[GEOMETRY_SUMS, :count]  # the first color of that frame is the depth
+            grad_depth += geometry[GEOMETRY_SUMS, :count]  # the first color channel of this frame is the depth
         frame = self._forward(model, camera, result.background)
         planes = np.zeros((*size, 3), np.float32) if image is None else _check_shape("image", image, (*size, 3))
         pixel_sums = self._pixel_sums(model, frame, planes)

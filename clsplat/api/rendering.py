@@ -42,7 +42,7 @@ def render_views(
         which the transmittance falls below ½, or 0 if it stays above; in scene units, as arrays [height, width]
     normals: also write NAME_normals, from the mean depth, in scene axes, as arrays [height, width, 3]; 0 where unknown
     alpha: also write NAME_alpha, in [0, 1], as arrays [height, width]
-    time: render a moving model at this time, in [0, 1], instead of at the times of the views
+    time: render a dynamic model at this time, in [0, 1], instead of at the times of the views
     """
     from clsplat.runs import video as videos
     from clsplat.runs.model_file import FORMATS, SPLITS, ModelFile, is_model_alone
@@ -84,27 +84,27 @@ def render_path(
 ) -> dict[str, Any]:
     """Render a video of a model along a camera path, as `clsplat render --path` does.
 
-    Returns `files`, the number of `frames`, `fps`, the duration in `seconds`, the `size` of a frame, and the rendering
-    time `took`, in seconds.
+    Returns a dictionary with `files`, the number of `frames`, `fps`, the duration in `seconds`, the `size` of a frame,
+    and the rendering time `took`, in seconds.
 
     model, scene: as for `render_views`
     video: a .webm file, or a .mp4 file if the extra `video` is installed; None writes images of this `format` to `out`
     path: ellipse, spiral, orbit, through, views, fixed, fixed:NAME with the name of a view, or a camera_path.json file;
-        a model file without a scene has orbit, ellipse, and fixed, with up at -y
+        for a model file without a scene, only orbit, ellipse, and fixed are available, and -y is up
     frames: 120 by default; a single image of a fixed camera is named view.png
     fps: 30 by default
     size: width and height, which must be even; default: the image size divided by `downscale`
-    times: for a moving model, one time in [0, 1], or the times of the first and last frame, such as (0, 1) or "0..1";
+    times: for a dynamic model, one time in [0, 1], or the times of the first and last frame, such as (0, 1) or "0..1";
         default: the full range, or the times of the views
     position, look_at: for the path `fixed`, the world coordinates, [3], of the camera and of the point to look at,
         by default the focus of the scene
     side: what the right half shows: "photograph" for the photo of the nearest camera, or the path of another model
     depth, normals, alpha: also write videos of these layers, as in `render_views`
 
-    Raises ConfigError for a value out of range, a missing scene, or a file that must not be replaced; DataError for an
-    unreadable file, or a path that the cameras do not permit; NumericError for images that are not finite; OutputError
-    for a file that cannot be written; DeviceError for a device that does not work, and MemoryLimitError for one with
-    too little memory.
+    Raises ConfigError for a value out of range, a missing scene, or a file that must not be replaced.  Raises DataError
+    for an unreadable file, or for a path that the cameras do not permit, and NumericError for images that are not
+    finite.  Raises OutputError for a file that cannot be written, DeviceError for a device that does not work, and
+    MemoryLimitError for a device with too little memory.
     """
     from clsplat.runs import video as videos
     from clsplat.viewer.video.plan import VideoRequest
@@ -136,7 +136,7 @@ def camera_path(
 
 
 def write_video(file: PathLike, images: "Iterable[NDArray[np.generic]]", fps: float = 30) -> int:
-    """Write images, [height, width, 3] in [0, 1] or uint8, as a .webm or .mp4 video.  Return the number of images.
+    """Write images, [height, width, 3], float in [0, 1] or uint8, as a .webm or .mp4 video.  Return their number.
 
     Raises ConfigError for any other suffix, or an odd width or height, and ValueError for images of different sizes.
     """
@@ -153,7 +153,7 @@ def write_cameras(
 ) -> list[Path]:
     """Write the cameras of a dataset or a run for other programs, as `clsplat data cameras` does; return the files.
 
-    format: sparse/0/*.txt of COLMAP, transforms.json of nerfstudio, or cameras.json of the reference implementation
+    format: sparse/0/*.bin of COLMAP, transforms.json of nerfstudio, or cameras.json of the original 3DGS code
     images: "copy" also copies the photos to out/images
 
     Raises DataError for a lens that the format does not support, and ConfigError if a file exists.

@@ -81,7 +81,9 @@ def measure_speed(
     schedule: ScheduleName = "auto",
     device: "str | Device | None" = None,
 ) -> "Measurement":
-    """Time the stages of a training step, as `clsplat bench` does.  Return times in ms, with `data()` and `text()`.
+    """Time the stages of a training step, as `clsplat bench` does.
+
+    Returns a measurement with times in ms; its methods are `data()` and `text()`.
 
     scenes: any of the fixed scenes A, B, and C
     model, scene: a splat file or point cloud and its dataset, which are timed as well
@@ -105,7 +107,7 @@ def measure_speed(
 def report_device(out: PathLike, scenes: Sequence[str] = ("A",), device: "str | Device | None" = None) -> None:
     """Check and time a device with each schedule for its kind, and write the results to a JSON file.
 
-    The file has the report of `doctor`, and the measurements by schedule.  Raises OutputError.
+    The file contains the report of `doctor` and the measurements by schedule.  Raises OutputError.
     """
     import json
 

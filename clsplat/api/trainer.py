@@ -60,10 +60,10 @@ class Report:
 class Trainer:
     """Trains a scene with a pipeline.  The result is bit-identical to that of `clsplat run`.
 
-    Stages before the training run in the constructor, and later stages that edit the model run at the end of the last
-    step.  Other stages, such as `evaluate` and `export`, do not run; use the method `evaluate` and the property
-    `model`.  Ctrl-C takes effect after the current step, and training can continue.  Threads may share a trainer; their
-    calls run one at a time.
+    The constructor runs the stages before `optimize`.  The last step also runs later stages that edit the model.  Other
+    stages, such as `evaluate` and `export`, do not run; use the method `evaluate` and the property `model`.  Ctrl-C
+    takes effect after the current step, and training can continue.  Threads may share a trainer; their calls run one
+    at a time.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Trainer:
         scene: a dataset folder, or a scene returned by `read_scene`, which keeps its split
         pipeline: a file, or the name of a shipped pipeline
         set: settings by key, such as {"optimize.steps": 3000}
-        device: part of the name of a device, or an open device with the schedule of the pipeline
+        device: part of the name of a device, or an open device with the schedule that the pipeline sets
         out: the run folder; default: a temporary folder that is deleted with the trainer
         start: as for `clsplat.run`
 

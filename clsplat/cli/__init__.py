@@ -14,9 +14,10 @@ from clsplat.core import signals, terminal
 from clsplat.core.errors import Interrupted, as_clsplat_error, one_line
 from clsplat.core.signals import stop_at_once, stopping_on_signals
 
-COMPLETION = "_CLSPLAT_COMPLETE"  # set where a shell asks for completions
+COMPLETION = "_CLSPLAT_COMPLETE"  # environment variable that a shell sets to request completions
 DEBUG, PLUGIN = "--debug", "--plugin"  # options that may come before or after the command
-OPTIONAL_VALUES = {"--live": ("0", str.isdecimal), "--depth": ("mean", ("mean", "median").__contains__)}  # default
+# options whose value is optional: the default, and a test of whether the next argument is a value
+OPTIONAL_VALUES = {"--live": ("0", str.isdecimal), "--depth": ("mean", ("mean", "median").__contains__)}
 
 
 def main(*prefix: str) -> None:
@@ -45,7 +46,7 @@ def _report(error: BaseException, is_debugging: bool) -> int:
     """Print a line for an error or for an interruption by the user, and return the exit code."""
     if isinstance(error, WrappedError | typer.Abort):
         error = error.__cause__ or error
-    if isinstance(error, KeyboardInterrupt):  # outside a run; a run says how to continue
+    if isinstance(error, KeyboardInterrupt):  # outside a run; the message of a run says how to continue
         error = Interrupted("stopped")
     if is_debugging:
         traceback.print_exception(error)
@@ -85,7 +86,7 @@ def _expand_set(arguments: list[str]) -> list[str]:
 
 
 def _expand_optional(arguments: list[str]) -> list[str]:
-    """Add the default to options whose value is optional: expand `--live` without a number to `--live=0`."""
+    """Add the default value to options that were given without their optional value: `--live` becomes `--live=0`."""
     expanded = []
     for argument, next_argument in zip(arguments, [*arguments, ""][1:], strict=True):
         default, is_value = OPTIONAL_VALUES.get(argument, ("", bool))

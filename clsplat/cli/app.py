@@ -39,7 +39,7 @@ SYNONYMS = {
     "version": "--version",
 }
 
-MIN_ADDRESS_SPACE = 1 << 30  # bytes; OpenCL runtimes need more
+MIN_ADDRESS_SPACE = 1 << 30  # bytes; OpenCL runtimes crash with less
 
 ORDER = [
     *("run", "blocks", "resume", "status", "cell", "cancel", "worker"),
@@ -127,7 +127,7 @@ def common(
         str | None, typer.Option(metavar="NAME", help="OpenCL device for commands that take --device.")
     ] = None,
     debug: Annotated[
-        bool, typer.Option("--debug", help="Show tracebacks and every log line; works after the command, too.")
+        bool, typer.Option("--debug", help="Show tracebacks and debug lines; may also come after the command.")
     ] = False,
     plugin: Annotated[
         list[Path] | None,

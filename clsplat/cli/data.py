@@ -27,7 +27,7 @@ def data() -> None:
 @app.command()
 def synthetic(
     out: Out,
-    size: Annotated[int, typer.Option(min=8, help="Width and height of the images, pixels.")] = 256,
+    size: Annotated[int, typer.Option(min=8, help="Width and height of the images, in pixels.")] = 256,
     train: Annotated[int, typer.Option(min=1, help="Number of training views.")] = 60,
     test: Annotated[int, typer.Option(min=1, help="Number of held-out views.")] = 12,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the surface points and their noise.")] = 0,
@@ -49,7 +49,7 @@ def photos(
     from clsplat.prepare.cache import place_photographs
 
     count = place_photographs(source, out, long_side, camera_model, matching, mapper)
-    print(f"{count} photos placed; the COLMAP folder is {out}")
+    print(f"{count} photos registered; the COLMAP folder is {out}")
 
 
 @app.command()
@@ -57,7 +57,7 @@ def video(
     file: Annotated[Path, typer.Argument(help="A video.")],
     out: Annotated[Path, typer.Argument(help="Folder for the frames.")],
     frames: Annotated[
-        int, typer.Option(min=1, help="Number of frames: the sharpest of each segment of equal motion.")
+        int, typer.Option(min=1, help="Number of frames: the sharpest one of each part with equal motion.")
     ] = 100,
     long_side: Annotated[int | None, typer.Option(min=16, help="Maximum size of the long side, pixels.")] = None,
     times: Annotated[
@@ -67,7 +67,7 @@ def video(
     """Extract sharp frames from a video, with equal camera motion between them."""
     from clsplat.data_tools.video import write_frames
 
-    print(f"{write_frames(file, out, frames, long_side, times)} frames in {out}")
+    print(f"{write_frames(file, out, frames, long_side, times)} frames written to {out}")
 
 
 @app.command()
@@ -82,7 +82,7 @@ def undistort(
     """Undistort the photos of a scene, including those of fisheye lenses."""
     from clsplat.prepare.undistort import undistort_scene
 
-    print(f"{undistort_scene(scene, out, long_side, undefined_pixels)} images in {out}")
+    print(f"{undistort_scene(scene, out, long_side, undefined_pixels)} images written to {out}")
 
 
 @app.command()
@@ -129,4 +129,4 @@ def lpips(
     from clsplat.data_tools.lpips import write_lpips
 
     write_lpips(out, net, source)
-    print(f"LPIPS with {net} in {out}")
+    print(f"LPIPS with {net} written to {out}")

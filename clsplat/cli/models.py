@@ -77,7 +77,7 @@ def evaluate(
 
 
 def _metrics_table(results: dict[str, Any]) -> str:
-    """Return metrics as a table with a row for each split and downscale factor."""
+    """Format metrics as a table with a row for each split and downscale factor."""
     rows = [
         {"split": split, "size": f"1/{downscale}", **averages}
         for split in ("test", "train")
@@ -129,17 +129,17 @@ TransformOption = Annotated[
     typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; also rotates SH."),
 ]
 MergeOption = Annotated[
-    int | None, typer.Option(metavar="N", min=1, help="Merge neighbors until N Gaussians remain, without the sky.")
+    int | None, typer.Option(metavar="N", min=1, help="Merge neighbors until N Gaussians remain, excluding the sky.")
 ]
 SkyOption = Annotated[
     Literal["splats", "none"] | None, typer.Option(help="Write a learned sky as distant Gaussians, or remove it.")
 ]
 ColliderOption = Annotated[
-    Path | None, typer.Option(metavar="MESH", help="OpenUSD: a .ply or .obj mesh to collide with; invisible.")
+    Path | None, typer.Option(metavar="MESH", help="OpenUSD: a .ply or .obj file for an invisible collision mesh.")
 ]
 FramesOption = Annotated[
     int | None,
-    typer.Option(metavar="N", help="Dynamic model: write N files, one per timestamp; OUT: a folder, or frame.spz."),
+    typer.Option(metavar="N", help="Dynamic model: write N files over time; OUT: a folder, or a file name to number."),
 ]
 
 
@@ -153,7 +153,7 @@ FramesOption = Annotated[
 def convert(
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="IN… OUT", help="Models to merge, and the file to write; its name sets the format."),
+        typer.Argument(metavar="IN… OUT", help="Models to merge, and the file to write; its suffix sets the format."),
     ],
     sh_degree: Annotated[int | None, typer.Option(metavar="N", help="Highest SH degree to keep.")] = None,
     quality: Annotated[
@@ -165,10 +165,10 @@ def convert(
         float, typer.Option(metavar="OPACITY", min=0, max=1, help="Drop Gaussians with a lower opacity.")
     ] = 0.0,
     filter_floaters: Annotated[
-        bool, typer.Option("--filter-floaters", help="Drop large and faint, isolated, and far Gaussians.")
+        bool, typer.Option("--filter-floaters", help="Drop Gaussians that are large and faint, isolated, or far away.")
     ] = False,
     level: Annotated[
-        bool, typer.Option("--level", help="Turn the model upright: its ground at y = 0, up is -y.")
+        bool, typer.Option("--level", help="Rotate the model upright: its ground is at y = 0, and -y points up.")
     ] = False,
     splats: MergeOption = None,
     sky: SkyOption = None,
@@ -176,7 +176,7 @@ def convert(
         float | None, typer.Option(metavar="T", help="Dynamic model: write it at this time, 0 to 1.")
     ] = None,
     frames: FramesOption = None,
-    world: Annotated[bool, typer.Option("--world", help="Write world coordinates, without an origin.")] = False,
+    world: Annotated[bool, typer.Option("--world", help="Write world coordinates, not relative to an origin.")] = False,
     collider: ColliderOption = None,
 ) -> None:
     """Convert models to another format: PLY, SPZ, SOG, glTF, OpenUSD, HTML, and others."""
@@ -218,7 +218,7 @@ def align(
     ],
     scene: SceneOption = None,
     level: Annotated[
-        Literal["cameras", "ground"] | None, typer.Option(help="Turn the scene upright, by its cameras or ground.")
+        Literal["cameras", "ground"] | None, typer.Option(help="Rotate the scene upright, by its cameras or ground.")
     ] = None,
     distance: Annotated[
         list[str] | None,
@@ -365,7 +365,7 @@ def mesh(
     ] = None,
     keep: Annotated[float, typer.Option(metavar="F", help="Fraction of the faces to keep.")] = 1.0,
     collision: Annotated[
-        bool, typer.Option("--collision", help="Write a closed collision mesh around all space not seen as free.")
+        bool, typer.Option("--collision", help="Write a closed collision mesh around all space not seen to be empty.")
     ] = False,
     scale: ScaleOption = None,
     device: DeviceOption = None,
@@ -503,7 +503,7 @@ def render(
 
 
 def _video_text(result: dict[str, Any], columns: int) -> str:
-    """Return a line of text that describes a video: size, duration, and rendering time."""
+    """Describe a video in a line of text: its size, duration, and rendering time."""
     first, *others = (Path(name) for name in result["files"])
     width, height = result["size"]
     summary = f"{result['frames']} frames of {columns * width} x {height} px in {result['took']:.1f} s"

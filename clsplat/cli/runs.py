@@ -77,7 +77,7 @@ def run(
 def resume(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="The folder of a run or a matrix.")],
     scene: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where the photos are now, if they were moved.")
+        Path | None, typer.Option(metavar="DIR", help="The new path of the dataset folder, if it was moved.")
     ] = None,
     device: DeviceOption = None,
     steps: Annotated[
@@ -85,8 +85,8 @@ def resume(
         typer.Option(
             min=1,
             metavar="N",
-            help="Train up to this step; the result equals that of a run of this length, unless a reset or pruning "
-            "was due at the former last step.",
+            help="Train up to this step; the result equals that of a new run with N steps, unless an opacity reset or "
+            "pruning was due at the former last step.",
         ),
     ] = None,
     set_: SetOption = None,
@@ -127,7 +127,7 @@ def status(
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of status.json.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the state, step, and metrics of a run, or of all cells of a store, from its files."""
+    """Show the state, step, and metrics of a run, or of all cells of a store."""
     from clsplat.runs.status import format_status
     from clsplat.sweeps.status import format_store_status
     from clsplat.workflows.blocks import format_status_table
@@ -224,7 +224,7 @@ def pipelines(
     """List the shipped pipelines, or the --set keys of a pipeline."""
     if copy is not None:
         if not name:
-            raise ConfigError("pipelines: --copy needs the name of a pipeline")
+            raise ConfigError("pipelines: --copy needs the name of a pipeline; `clsplat pipelines` lists them")
         target = commands.copy_pipeline(name, copy)
         if as_json:
             terminal.show_json({"copy": str(target)})
@@ -254,13 +254,13 @@ def blocks(
         Path,
         typer.Option(metavar="DIR", help="Dataset or run folder.", show_default=False),
     ] = ...,  # type: ignore[assignment]
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the runs of all blocks and the model.")] = Path(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the block runs and the merged model.")] = Path(
         "runs/blocks"
     ),
     count: Annotated[int, typer.Option("--blocks", metavar="N", help="Number of blocks.")] = 4,
     coarse: Annotated[
         str,
-        typer.Option(metavar="PIPELINE|MODEL|RUN", help="Coarse model to partition, or a pipeline to train it."),
+        typer.Option(metavar="PIPELINE|MODEL|RUN", help="Coarse model to partition, or a pipeline that trains it."),
     ] = "blocks_coarse",
     min_coverage: Annotated[
         float,
@@ -330,7 +330,7 @@ def cell(
     device: DeviceOption = None,
     set_: SetOption = None,
 ) -> None:
-    """Run one cell of a matrix, unless its result is in the store.  Made for the job arrays of any scheduler."""
+    """Run one cell of a matrix, unless its result is in the store.  Use it in job arrays of any scheduler."""
     commands.run_cell(pipeline, store, scene, index=index, set=set_ or (), device=device)
 
 
@@ -341,7 +341,7 @@ def cancel(
         str | None, typer.Argument(metavar="[CELL]", help="A cell's name or key; default: all cells.")
     ] = None,
 ) -> None:
-    """Ask running cells, on any machine, to save their state and stop."""
+    """Request that running cells, on any machine, save their state and stop."""
     terminal.print_message(f"{store}: stop requested for {commands.cancel(store, cell)}")
 
 

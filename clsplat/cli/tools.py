@@ -45,7 +45,7 @@ def doctor(
         terminal.show_json(report.data())
     else:
         terminal.show(report.text())
-    if page is not None:  # after the verdict, which took minutes
+    if page is not None:  # after the verdict is printed: it took minutes, and writing the page may fail
         write_page(report, page)
     if not report.usable:
         raise DeviceError(f"{report.info.label}: {report.verdict.text}")
@@ -76,12 +76,12 @@ def inspect(
     count: Annotated[
         int | None,
         typer.Option(
-            "--blocks", metavar="N", help="Only show how N blocks would partition the points: views, memory, time."
+            "--blocks", metavar="N", help="Only partition the points into N blocks, and show views, memory, and time."
         ),
     ] = None,
     device: DeviceOption = None,
 ) -> None:
-    """Report problems of a dataset or photos, and whether training can use them; exit code 3 if not."""
+    """Report problems in a dataset or photos, and whether they can be used for training; exit code 3 if not."""
     from clsplat.prepare.inspect.findings import show
     from clsplat.workflows.blocks import format_table
 

@@ -15,7 +15,7 @@ from itertools import islice
 
 MESSAGE_LIMIT = 1000  # characters
 QUOTE_LIMIT = 80  # characters of a value in a message
-MAX_NAMES = 8  # of a list in a message
+MAX_NAMES = 8  # names of a list in a message
 PLUGIN_MARK = "__clsplat_plugin__"  # module variable that marks plug-in code
 
 
@@ -110,9 +110,9 @@ def as_clsplat_error(error: BaseException) -> ClsplatError:
     if isinstance(error, MemoryError):
         return MemoryLimitError("out of memory; use fewer Gaussians, or fewer or smaller images (scene.downscale)")
     if isinstance(error, ImportError) and "failed to map segment" in str(error):
-        reason = "too little memory or address space (`ulimit -v`), or a file system mounted with `noexec`"
-        return MemoryLimitError(f"{one_line(error)}: {reason}")
-    # the name of an input: `write_error` has already converted errors about outputs
+        remedy = "free up memory, raise `ulimit -v`, or use a file system that is mounted without `noexec`"
+        return MemoryLimitError(f"{one_line(error)}; {remedy}")
+    # this is the name of an input, because `write_error` has already converted errors about outputs
     if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
         return DataError(f"{error.filename}: cannot be read ({error.strerror}); expected the path of a file or folder")
     if isinstance(error, OSError) and error.strerror:
@@ -148,7 +148,7 @@ def pluralize(count: int, word: str) -> str:
 
 
 def size_text(gaussians: int | None, parameters: int | None, sky: int = 0) -> str:
-    """Format the size of a model: the numbers of Gaussians and of `sky` Gaussians, or of the parameters of a field."""
+    """Format the size of a model: its numbers of Gaussians and `sky` Gaussians, or a field's number of parameters."""
     text = f"{parameters or 0:,} parameters" if gaussians is None else f"{gaussians:,} Gaussians"
     return f"{text} and {sky:,} of the sky" if sky else text
 
@@ -159,7 +159,7 @@ def shell_quote(path: object) -> str:
 
 
 def shorten(text: str, limit: int = QUOTE_LIMIT) -> str:
-    """Return the text, without its middle if it is longer than `limit` characters."""
+    """Return the text; if it is longer than `limit` characters, replace its middle with an ellipsis."""
     size = limit - 3
     return text if len(text) <= limit else f"{text[: size - size // 2]} … {text[-(size // 2) :]}"
 

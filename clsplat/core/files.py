@@ -19,6 +19,7 @@ from clsplat.core.reading import read_json
 LOG = logging.getLogger("clsplat")
 # names of temporary files: .NAME.PID-NUMBER.partial
 PARTIAL = re.compile(r"\..+\.(\d+)-\d+\.partial(\.\w+)?")
+# error codes of systems that cannot sync a file or folder
 NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF, errno.EACCES, errno.EPERM}
 SYSTEM = os.name
 _number = itertools.count()
@@ -208,7 +209,7 @@ def _remove_partial_folders(folder: Path) -> None:
 
 
 def _is_abandoned(name: str) -> bool:
-    """Return whether a name is that of a temporary file or folder that no process on this machine is still writing."""
+    """Return whether a name is that of a temporary file or folder that no process on this machine writes anymore."""
     if not (match := PARTIAL.fullmatch(name)) or name in _temporary_names:
         return False
     pid = int(match[1])
@@ -250,7 +251,7 @@ UNDISTORTED = "undistorted"
 PREPARED = "prepared"
 COMPARISON = "compare.html"
 STORE = "store"  # results of the cells of a matrix
-MODULE_FILE_PREFIX = "view_"  # side files of training modules
+MODULE_FILE_PREFIX = "view_"  # of files in which training modules store values for each view
 RESERVED_NAMES = frozenset(
     {
         *(PIPELINE, METRICS, RECORDS, TRIAL, STATUS, LOG_FILE, PREPARE_SUMMARY, INPUTS, CHECKSUMS, LOCK),

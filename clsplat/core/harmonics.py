@@ -5,8 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-DIRECTIONS = 64  # samples: enough to fit the 7 functions of a band and, with the opposite directions, all products
-BAND_0 = 0.28209479177387814
+# sampled directions: enough to fit the 7 functions of band 3 and, with the opposite directions, all products of two
+DIRECTIONS = 64
+BAND_0 = 0.28209479177387814  # the basis function of band 0, a constant
 BLOCK_ROWS = 4096  # Gaussians per block, to limit temporary memory
 Floats = NDArray[np.float64]
 MEAN_DECIMALS = 6  # decimals of means; further digits differ between processors
@@ -47,7 +48,7 @@ def mean_basis(form: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotate coefficients [N, (K-1)*3], coefficient-major, by a rotation matrix [3, 3].
+    """Rotate SH coefficients, [N, (K-1)*3] in coefficient-major order, by a rotation matrix, [3, 3].
 
     A rotation maps each band onto itself, so each band's matrix follows from values in a few directions.
     """
@@ -67,7 +68,7 @@ def rotate_sh(sh_rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> N
 
 
 def map_colors(coefficients: NDArray[np.floating], curve: Callable[[Floats], Floats]) -> Floats:
-    """Apply a color curve to coefficients, [N, K, 3], by least squares over all directions.
+    """Apply a color curve to SH coefficients, [N, K, 3], by a least-squares fit over fixed directions.
 
     With band 0 only, the result is exact.
     """

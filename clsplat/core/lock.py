@@ -1,9 +1,9 @@
 """Lock folders, so that only one process at a time uses a folder.
 
-The system releases the lock when its owner exits for any reason, so no lock becomes stale.  The file `run.lock` names
-the owner.  On a file system without locks, the process that creates this file owns the folder; a file whose process
-has exited on this host is taken over.  Where locks are local to each machine, as on some NFS and sshfs mounts, a run on
-another machine is detected by its heartbeat.
+The operating system releases a lock when its owner exits for any reason, so locks never become stale.  The file
+`run.lock` names the owner.  On a file system without lock support, the process that creates this file owns the folder;
+when that process has exited on this host, another process takes over the file.  Where locks are local to each machine,
+as on some NFS and sshfs mounts, a run on another machine is detected by its heartbeat.
 """
 
 import errno
@@ -25,14 +25,14 @@ from clsplat.core.files import END_STATES, HEARTBEAT_TIMEOUT, LOCK, STATUS, rais
 from clsplat.core.machine import Owner
 from clsplat.core.reading import read_json
 
-# The owner of a folder, read from its lock file, and messages about it.
+# The owner of a folder, as recorded in the lock file, and error messages that name the owner.
 
 LOG = logging.getLogger("clsplat")
 LOCK_OFFSET = 1 << 20  # position of the locked byte; after the text, because Windows blocks reads of a locked byte
 
 
 def owner_record() -> str:
-    """Return the lock file's content for this process, as JSON."""
+    """Return the content of a lock file whose owner is this process, as JSON."""
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
     return json.dumps({**asdict(Owner.current()), "time": time.time(), "command": command})
 
@@ -48,10 +48,11 @@ def read_owner(file: io.FileIO) -> dict[str, Any]:
 
 
 def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Return the owner in a lock file if it is on another machine, whose lock may be invisible here; otherwise {}.
+    """Return the record of a lock file's owner if the owner is on another machine; otherwise return {}.
 
-    Machines may share a name, so boot IDs are compared where both are known.
-    Raises OutputError if the heartbeat in the run's status, a file next to the lock file, is recent.
+    A lock of another machine may be invisible here.  The owner's heartbeat, the time in the status file next to the
+    lock file, then shows whether the owner is running.  Machines may share a name, so boot IDs are compared where both
+    are known.  Raises OutputError if the heartbeat is recent.
     """
     record = read_owner(file)
     owner, local = Owner.from_record(record), Owner.current()
@@ -60,17 +61,17 @@ def require_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[s
     heartbeat = _heartbeat(path)
     if heartbeat is not None and (age := time.time() - heartbeat) < HEARTBEAT_TIMEOUT:
         raise OutputError(
-            f"{in_use_message(folder, record)}; the last heartbeat of that process is {max(0, age):.0f} s old; "
-            f"if it has exited, wait a minute or remove {path}"
+            f"{in_use_message(folder, record)}; the last heartbeat of that process was {max(0, age):.0f} s ago; "
+            f"if the process has exited, wait a minute or remove {path}"
         )
     return record
 
 
 def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Wait until the owner's heartbeat is stale, and return the same as `require_stale_heartbeat`.
+    """Wait until the owner's heartbeat is stale, and return the owner's record, as `require_stale_heartbeat` does.
 
-    A heartbeat is recognized by a change, not by its time, because the clocks of two machines may differ.
-    Raises OutputError if the heartbeat changes.
+    The clocks of two machines may differ, so a recent heartbeat alone proves nothing: the owner is running if its
+    heartbeat changes during the wait.  Raises OutputError in that case.
     """
     heartbeat, deadline, is_logged = _heartbeat(path), time.monotonic() + HEARTBEAT_TIMEOUT, False
     while True:
@@ -93,7 +94,7 @@ def wait_for_stale_heartbeat(file: io.FileIO, path: Path, folder: Path) -> dict[
 def _heartbeat(path: Path) -> float | None:
     """Return the time of a run's last status, in seconds since 1970; None if the run has no status or has ended.
 
-    The status is in the same folder as `path`, the lock file.
+    The status file is in the folder of the lock file, `path`.
     """
     with suppress(DataError, AttributeError, KeyError, TypeError, ValueError):
         status = read_json(path.with_name(STATUS), limit=LOCK_OFFSET)
@@ -129,6 +130,7 @@ def in_use_message(folder: Path, owner: dict[str, Any]) -> str:
 
 
 LOCK_TAKEN = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}  # error codes for a lock that another process holds
+# error codes of a file system without lock support
 NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
 _locked_files: set[Path] = set()  # lock files that this process holds or is locking
 _locked_files_lock = threading.Lock()
@@ -136,10 +138,10 @@ _locked_files_lock = threading.Lock()
 
 @contextmanager
 def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[], None]]:
-    """Lock a folder during the block, with the lock file `path`, by default `run.lock` inside.
+    """Lock a folder during the block.  The lock file is `path`, by default `run.lock` in the folder.
 
-    Yields a function that raises OutputError if that file was removed or replaced, since another process may then use
-    the folder.  Raises OutputError, which names the process and host, if another process holds the lock.
+    Yields a function that raises OutputError if the lock file was removed or replaced, because another process may then
+    use the folder.  Raises OutputError, with the owner's process ID and host, if another process holds the lock.
     """
     path = _resolve(folder, path or folder / LOCK)
     with _reserve(path, folder):
@@ -147,7 +149,7 @@ def lock_folder(folder: Path, path: Path | None = None) -> Iterator[Callable[[],
             file = _acquire(path, folder)
 
         def require_lock() -> None:
-            with suppress(OSError):  # an unreadable folder: the next write reports that
+            with suppress(OSError):  # if the folder is unreadable, the next write reports it
                 if not file.closed and not _is_still_at(file, path):
                     raise OutputError(lost_lock_message(path, folder))
 
@@ -176,9 +178,9 @@ def _reserve(path: Path, folder: Path) -> Iterator[None]:
 
 
 def check_free(folder: Path) -> bool:
-    """Raise OutputError if `lock_folder` would fail at once, without writing anything.
+    """Raise OutputError if `lock_folder` would fail immediately.  Write no files.
 
-    Returns False if `lock_folder` would wait for the heartbeat of a run on another machine.
+    Returns False if `lock_folder` would wait for the heartbeat of a run on another machine, otherwise True.
     """
     path = _resolve(folder, folder / LOCK)
     with raising_output_error(path), suppress(FileNotFoundError), path.open("r+b", buffering=0) as file:
@@ -198,7 +200,7 @@ def check_free(folder: Path) -> bool:
 
 
 def _resolve(folder: Path, file: Path) -> Path:
-    """Return the canonical path of a lock file.  Raises OutputError if this process holds it."""
+    """Return the canonical path of a lock file.  Raises OutputError if this process holds it, or if it is a link."""
     path = file.parent.resolve() / file.name
     _require_not_held(path, folder)
     if path.is_symlink():
@@ -209,12 +211,12 @@ def _resolve(folder: Path, file: Path) -> Path:
 def _require_not_held(path: Path, folder: Path) -> None:
     if path in _locked_files:
         raise OutputError(
-            f"{folder}: is in use by this process; close that run or trainer first, or use another folder"
+            f"{folder}: is in use by this process; close the run or trainer that uses it, or use another folder"
         )
 
 
 def _acquire(path: Path, folder: Path) -> io.FileIO:
-    """Open and lock a lock file, and record this process as its owner.  Raises OutputError, OSError."""
+    """Open and lock a lock file, and record this process as its owner.  Raises OutputError or OSError."""
     while True:
         file, is_new = _open_lock_file(path)
         if file is None:
@@ -241,7 +243,10 @@ def _open_lock_file(path: Path) -> tuple[io.FileIO | None, bool]:
 
 
 def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> bool:
-    """Lock the file, or return False if it is not at its path anymore.  Without locks, the file's creator owns it."""
+    """Lock the file and return True, or return False if the file is no longer at its path.
+
+    Without lock support, the process that created the file owns it.
+    """
     try:
         if not _system_lock(file):
             raise OutputError(in_use_message(folder, read_owner(file)))
@@ -250,7 +255,7 @@ def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> 
         if not is_new and (owner := wait_for_stale_heartbeat(file, path, folder)):
             LOG.info("%s: taken over from process %s on %s", folder, owner.get("process"), owner.get("host"))
             with suppress(PermissionError):  # Windows cannot rename an open file
-                _remove(file, path)  # so that the previous owner notices, in case it still runs
+                _remove(file, path)  # so that the previous owner, if it is still running, notices
                 return False
         return True
     except OSError as error:
@@ -261,7 +266,7 @@ def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> 
         LOG.info("%s: taken over from process %s, which has exited", folder, owner.get("process"))
         _remove(file, path)
         return False
-    LOG.warning("%s: the file system does not support locks; only %s keeps other processes away", folder, path.name)
+    LOG.warning("%s: the file system does not support locks; do not delete %s during the run", folder, path.name)
     return True
 
 
@@ -290,7 +295,7 @@ def _remove(file: io.FileIO, path: Path) -> None:
 
 
 def _system_lock(file: io.FileIO) -> bool:
-    """Lock an open file; return False if another process holds the lock.  Raises OSError without lock support."""
+    """Lock an open file; return False if another process holds the lock.  Raises OSError if locks are unsupported."""
     try:
         if os.name == "nt":
             import msvcrt
@@ -319,5 +324,5 @@ def _is_still_at(file: io.FileIO, path: Path) -> bool:
 
 
 def _has_exited(owner: Owner | None) -> bool:
-    # an owner equal to this process is an earlier process with the same ID: `_resolve` rules out locks held here
+    # an owner that equals this process is an earlier process with the same ID, since `_resolve` rejects our own locks
     return owner is not None and (owner == Owner.current() or owner.has_ended)

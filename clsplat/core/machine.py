@@ -31,9 +31,10 @@ MIN_SPACE = 16 << 20  # bytes; the built kernels of a device take a few MB
 def cache_folder() -> Path:
     """Return the cache folder of clsplat, which exists, is writable, and belongs to the user.
 
-    The user's cache folders may not be writable, as in a container without a home, or may have little free space.  All
-    caches, including those of the libraries, then move to the temporary folder, with a warning, because compilers abort
-    the process when a built kernel does not fit.  Raises OutputError if the temporary folder is not writable either.
+    The user's cache folders may not be writable, as in a container without a home, or may have little free space.  In
+    these cases, all caches, including those of the libraries, move to the temporary folder, and a warning is logged: a
+    compiler aborts the process when a built kernel does not fit.  Raises OutputError if the temporary folder is not
+    writable either.
     """
     try:
         folders = [Path(platformdirs.user_cache_dir(name, name)) for name in ("clsplat", *LIBRARIES)]
@@ -192,8 +193,8 @@ class Owner:
     def has_ended(self) -> bool:
         """Whether the process is known to have exited; False for most processes on other hosts or in other containers.
 
-        A process of an earlier boot has exited if it ran outside containers: containers on two machines may share a
-        name.
+        A process from an earlier boot of this machine has exited if it ran outside containers.  For a process inside a
+        container this is unknown, because containers on two machines may share a name.
         """
         if self.is_local:
             return not is_alive(self.process)

@@ -32,7 +32,7 @@ JPEG_QUALITY = 92
 
 
 def render(template: str, **values: Any) -> str:
-    """Render a template of `templates/` and return the page.  Invalid Unicode becomes `?`."""
+    """Render a template from `templates/` and return the page.  Invalid Unicode becomes `?`."""
     text = TEMPLATES.get_template(template).render(**values)
     return text.encode("utf-8", "replace").decode("utf-8")
 
@@ -57,7 +57,7 @@ class Inline:
 
 
 def inline(text: str) -> Inline:
-    """Mark a script or style of the package as safe.  Raises ValueError if it would close its own element."""
+    """Mark a script or style of the package as safe.  Raises ValueError if the text would close its HTML element."""
     if "</" in text:
         raise ValueError("a script or style contains '</', which closes its element")
     digest = hashlib.sha256(text.encode()).digest()
@@ -77,7 +77,7 @@ def duration_text(seconds: float) -> str:
 
 
 def data_url(image: NDArray[np.uint8], suffix: str = ".jpg") -> str:
-    """Encode an RGB image, [height, width, 3], as a data URL, in JPEG or, with suffix .png, losslessly."""
+    """Encode an RGB image, [height, width, 3], as a data URL in JPEG format, or in PNG format if `suffix` is .png."""
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if suffix == ".jpg" else []
     _, data = cv2.imencode(suffix, image[..., ::-1], options)
     subtype = "jpeg" if suffix == ".jpg" else "png"
@@ -100,6 +100,6 @@ THUMBNAIL = 160  # px, the longer side
 
 
 def render_summary(rows: Mapping[str, str], images: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> str:
-    """Return an HTML fragment with a table of names and values, and with named RGB images, [height, width, 3]."""
+    """Return an HTML fragment with a table of names and values, and thumbnails of RGB images, [height, width, 3]."""
     thumbnails = [(name, data_url(downscale(image, THUMBNAIL))) for name, image in images]
     return render("notebook.html.j2", rows=rows, thumbnails=thumbnails)

@@ -16,7 +16,7 @@ LOG = logging.getLogger("clsplat")
 Item = TypeVar("Item")
 INTERVAL = 5.0  # seconds between log lines
 MIN_POLL_INTERVAL, MAX_POLL_INTERVAL = 0.5, 5.0  # seconds
-MAX_POLLS = 40  # longer intervals keep polls below this number, since a poll may start a process
+MAX_POLLS = 40  # the interval grows to 1 / MAX_POLLS of the elapsed time, since a poll may start a process
 
 
 class Listener(Protocol):
@@ -61,7 +61,7 @@ def captured_log(level: int) -> Iterator[list[str]]:
 def listening(listener: Listener) -> Iterator[None]:
     """Call `listener`, and the listeners of enclosing blocks, for each step of the work in this block.
 
-    It is called from the thread of the block or from the thread of `polled`.
+    Listeners are called from the thread of the block or from the thread of `polled`.
     """
     outer_listener = _listener.get()
 
@@ -92,13 +92,13 @@ class ItemCounter:
     def __init__(self, label: str, total: int, is_uniform: bool = True) -> None:
         """is_uniform: whether all items take about the same time, so that the remaining time can be estimated."""
         self.label, self.total, self.done, self.is_uniform = label, total, 0, is_uniform
-        self._start: tuple[float, int] | None = None  # time of the first report, and number of items then done
+        self._start: tuple[float, int] | None = None  # time of the first report, and number of items done by then
         self._logged = time.monotonic()
         self.reach(0)
 
     @property
     def seconds_left(self) -> float | None:
-        """The estimated time for the remaining items; None before the first item is done."""
+        """The estimated time for the remaining items; None before the first item is done, or if not `is_uniform`."""
         if not self.is_uniform or self._start is None or self.done <= self._start[1]:
             return None
         start, start_count = self._start

@@ -18,7 +18,7 @@ def resource_dir(name: str) -> Path:
     for base in (PACKAGE, PACKAGE.parent):
         if (base / name).is_dir():
             return base / name
-    raise FileNotFoundError(f"{name}/ is missing next to {PACKAGE}")
+    raise FileNotFoundError(f"{name}/ is missing in {PACKAGE} and next to it; install clsplat again")
 
 
 @cache
@@ -34,7 +34,7 @@ def full_version() -> str:
 
 
 def list_sources() -> list[str]:
-    """Return names and hashes of all Python files and kernels, which determine the results."""
+    """Return the names and hashes of the Python files and kernels that determine the results."""
     tools = PACKAGE / "data_tools"  # in a wheel; a checkout has it next to the package
     modules = [path for path in PACKAGE.rglob("*.py") if not path.is_relative_to(tools)]
     folder = resource_dir("cl_kernels")

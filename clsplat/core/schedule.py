@@ -57,7 +57,7 @@ class Curve(Settings):
         """Values of the curve, including the smallest and the largest, to check against bounds."""
 
     def divide(self, factor: float) -> "Curve":
-        """Return the curve with its values divided by a factor.  Raises ConfigError if it does not support that."""
+        """Return the curve with its values divided by a factor.  Raises ConfigError if the curve does not allow it."""
         raise ConfigError(
             f"{type(self).__name__}: cannot be rescaled to another number of steps; use a number or a list of points"
         )
@@ -142,7 +142,10 @@ NOTATIONS = (
 
 
 def explain_schedule(more: str = "") -> WrapValidator:
-    """Return a validator that reports each error as one sentence, for any notation.  more: other accepted values."""
+    """Return a validator that reports an error in any notation of a schedule as one sentence.
+
+    more: text about other accepted values, for the end of the sentence
+    """
     return in_one_sentence(NOTATIONS + more)
 
 

@@ -1,7 +1,7 @@
 """Define settings: frozen models whose fields are the keys of a pipeline file, and the named variants of a key.
 
-A variant is a subclass with a name, the literal of its field `type`, or `stage` for stages.  A pipeline file can
-use it as soon as its class is defined, in the package or in a plug-in.  There is no other list of variants.
+A variant is a subclass with a name, which is the `Literal` of its field `type`, or `stage` for stages.  A pipeline file
+can use a variant as soon as its class is defined, in the package or in a plug-in.  There is no other list of variants.
 """
 
 import ast
@@ -38,17 +38,20 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
     subclasses: ClassVar[list[type["Settings"]]] = []  # all subclasses in order of definition
-    output_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume: the model does not depend on them
-    training_keys: ClassVar[frozenset[str]] = frozenset()  # may change on resume, but the model then differs
+    output_keys: ClassVar[frozenset[str]] = frozenset()  # keys that may change on resume without changing the model
+    training_keys: ClassVar[frozenset[str]] = frozenset()  # keys that may change on resume and then change the model
     step_keys: ClassVar[frozenset[str]] = frozenset()  # step numbers that scale with the length of training
     keyed_by_type: ClassVar[bool] = False  # lists contain each type at most once, and items are addressed by type
     rate_keys: ClassVar[frozenset[str]] = (
         frozenset()
-    )  # schedules whose values are divided when training is longer, so that sums stay the same
-    family: ClassVar[str] = ""  # a name besides the type that `conflicts` of other settings may use
-    unavailable: ClassVar[Mapping[str, str]] = {}  # unknown keys that other settings have, each with advice
+    )  # schedules whose values are divided when training is longer, so that their sum over all steps stays the same
+    family: ClassVar[str] = ""  # a second name, in addition to the type, for use in `conflicts` of other settings
+    unavailable: ClassVar[Mapping[str, str]] = {}  # keys that are valid elsewhere but not here, each with advice
     conflicts: ClassVar[Mapping[str, str]] = {}
-    """Types or families that exclude this one, in the same stage or outside of stages, each with `reason; advice`."""
+    """Types or families that may not occur in the same stage as these settings, or outside of all stages.
+
+    Each value is `reason; advice`.
+    """
 
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
@@ -99,9 +102,9 @@ def iter_settings(value: Any, path: str = "") -> Iterator[tuple[str, Settings]]:
 
 @functools.cache
 def descriptions(cls: type[BaseModel]) -> dict[str, str]:
-    """Return the docstrings of a class's fields by name, or nothing if its source cannot be read.
+    """Return the docstrings of a class's fields by name, except those whose source code cannot be read.
 
-    The source is parsed on demand: parsing all classes would make the start a third slower.
+    The source is parsed on demand, because parsing all classes at startup would make it a third slower.
     """
     result: dict[str, str] = {}
     for base in reversed(cls.__mro__):
@@ -211,7 +214,7 @@ def _check_path(text: str) -> str:
 def in_one_sentence(expected: str) -> WrapValidator:
     """Return a validator that reports an error in any notation of a field as one sentence.
 
-    The sentence is the first message of a validator, or `expected`.
+    The sentence is the first message that a validator of the field raised, or `expected` if there is none.
     """
 
     def validate_any(value: Any, validate: Callable[[Any], Any]) -> Any:
@@ -265,7 +268,7 @@ def import_modules(package: str, path: Iterable[str]) -> None:
 def rebuild_models() -> None:
     """Rebuild all models, so that their fields accept variants defined later, such as those of a plug-in."""
     built_models = [cls for cls in Settings.subclasses if cls.__pydantic_complete__]  # others: built on first use
-    for cls in built_models:  # schemas contain those of nested variants
+    for cls in built_models:  # a schema contains the schemas of nested variants
         if "__pydantic_core_schema__" in vars(cls):
             del cls.__pydantic_core_schema__
     for cls in built_models:

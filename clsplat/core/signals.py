@@ -14,12 +14,12 @@ from typing import Any, NoReturn, TextIO
 from clsplat.core.errors import OutputError
 
 NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")  # SIGBREAK: Ctrl-Break on Windows, or a closed window
-EXIT_DELAY_S = 60.0  # seconds to stop after stdin has closed, before the process exits
+EXIT_DELAY_S = 60.0  # seconds between the end of stdin and a forced exit
 IMPORT_SECONDS = 10.0  # longest wait for an import; the import of a plug-in may never end
 
 
 class _Received:
-    """The signals received in the outermost block, and the number of nested blocks."""
+    """The signals received since the outermost `stopping_on_signals` block began, and the number of nested blocks."""
 
     def __init__(self) -> None:
         self.blocks = 0
@@ -37,8 +37,8 @@ _received = _Received()
 def exit_on_signals() -> None:
     """Make signals exit the process with a message and exit code 130, except in `stopping_on_signals` blocks.
 
-    Call it at startup, before anything is written: importing an extension turns KeyboardInterrupt into an abort, and
-    some libraries catch every exception.
+    Call it at startup, before anything is written.  KeyboardInterrupt is not reliable: during the import of an
+    extension module it aborts the process, and some libraries catch every exception.
     """
     for number in _handlers():
         signal.signal(number, _exit)
@@ -51,12 +51,15 @@ def _exit(number: int, frame: Any) -> NoReturn:
 
 
 def stop_when_stdin_closes() -> None:
-    """Stop the process, as SIGTERM does, when its parent closes stdin to stop it, or exits."""
+    """Stop the process, as SIGTERM would, when stdin closes because the parent process closed it or exited."""
     threading.Thread(target=_watch_stdin, name="input", daemon=True).start()
 
 
 def _watch_stdin() -> None:
-    """Wait for the end of stdin with os.read: a pending buffered read would abort the interpreter at exit."""
+    """Wait for the end of stdin, and stop the process.
+
+    This uses os.read, because a pending buffered read would abort the interpreter at exit.
+    """
     with suppress(OSError):
         while os.read(0, 4096):
             pass
@@ -74,7 +77,7 @@ def _handlers() -> dict[int, Any]:
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` on Ctrl-C, SIGTERM, and SIGHUP; without effect outside the main thread."""
+    """Call `stop` on Ctrl-C, SIGTERM, and SIGHUP during the block.  Outside the main thread, this has no effect."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -98,16 +101,17 @@ def stopping_on_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 
 def stop_at_once() -> None:
-    """Raise KeyboardInterrupt.  During an import, which the exception would break, wait until it has finished."""
+    """Raise KeyboardInterrupt; during an import, which the exception would break, resend the signal a moment later."""
     wait_seconds = time.monotonic() - _received.since if _received.number else 0.0
     if wait_seconds < IMPORT_SECONDS and _is_importing():
-        _thread.start_new_thread(_resend_signal, (_received.number or signal.SIGINT,))  # `threading` would take a lock
+        # `threading` would acquire a lock
+        _thread.start_new_thread(_resend_signal, (_received.number or signal.SIGINT,))
     else:
         raise KeyboardInterrupt
 
 
 def stop_if_signaled() -> None:
-    """Raise KeyboardInterrupt if the outermost block received a signal; a library may have suppressed its exception."""
+    """Raise KeyboardInterrupt if the outermost block received a signal, in case a library caught the exception."""
     if _received.number and threading.current_thread() is threading.main_thread():
         raise KeyboardInterrupt
 
@@ -139,7 +143,7 @@ class Stream:
     @property
     def _raw(self) -> Any:
         stream = getattr(sys, self.name)
-        stream = getattr(stream, "rich_proxied_file", stream)  # while a live line is shown
+        stream = getattr(stream, "rich_proxied_file", stream)  # while rich draws a live display
         return self._original if stream is self else stream
 
     @property
@@ -190,7 +194,10 @@ STDOUT, STDERR = Stream("stdout"), Stream("stderr")
 
 
 def install() -> None:
-    """Make printing never fail, and open closed descriptors on the null device, so that no later file gets them."""
+    """Keep printing from raising errors, and open closed standard descriptors on the null device.
+
+    Otherwise, a file opened later would get the number of a closed descriptor, and printed text would go to the file.
+    """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
@@ -226,7 +233,7 @@ def _redirect_to_null(stream: Any) -> None:
 def take_stdin() -> int:
     """Return a private descriptor of stdin, and replace stdin with an empty file for OpenCL runtimes.
 
-    On Windows, querying a pipe can block.
+    On Windows, a runtime that queries a pipe can block.
     """
     pipe, empty = os.dup(0), os.open(os.devnull, os.O_RDONLY)
     os.dup2(empty, 0)

@@ -83,7 +83,7 @@ def show_json(data: Any) -> None:
 
 
 class _LogFile(logging.FileHandler):
-    """A log file.  If a line cannot be written, it warns once and continues."""
+    """A handler that writes a log file.  If a line cannot be written, the handler warns once and continues."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, encoding="utf-8", errors="backslashreplace")
@@ -97,7 +97,7 @@ class _LogFile(logging.FileHandler):
             LOG.warning("%s: cannot be written (%s); continuing without this log", self.baseFilename, reason)
 
     def close(self) -> None:
-        with suppress(OSError):  # buffered lines; handleError has warned
+        with suppress(OSError):  # from buffered lines; handleError has already warned
             super().close()
 
 
@@ -159,7 +159,7 @@ def device_text(device: dict[str, Any]) -> str:
 
 @contextmanager
 def progress_bar(status: StatusSource) -> Iterator[Callable[[TrainingProgress], None]]:
-    """Yield a function that shows progress reports; between reports a terminal shows the counts of `status`."""
+    """Yield a function that shows progress reports.  Between reports, a terminal shows the counts in `status`."""
     if not CONSOLE.is_terminal:
         yield lambda progress: LOG.info(progress_line(progress))
         return
@@ -186,7 +186,7 @@ def counts_on_terminal() -> Iterator[None]:
 
 
 class _RunBar:
-    """The progress bar of a run, computed from its status when drawn, so that training never waits for it."""
+    """The progress bar of a run.  It is computed from the run's status when drawn, so training never waits for it."""
 
     def __init__(self, status: StatusSource) -> None:
         self.status, self.bar = status, _create_bar()
