@@ -9,14 +9,16 @@ from numpy.typing import NDArray
 
 from clsplat.opencl.device import Device
 
-# Bounds on relative errors of float32 results.
 
-PROJECTION = 2e-5  # values of a splat: about 300 operations, and determinants with cancellation
-CONIC = 1e-4  # a conic, or a gradient of the projection, relative to its norm
-DEPTH = 1e-6
-GRADIENT = 2e-4  # a gradient through blending, relative to its norm
-SUM = 1e-5  # a sum of a few hundred positive values
-LOSS_GRADIENT = 2e-4  # relative to the largest value of the gradient
+class Tol:
+    """Tolerances of float32 results: bounds on relative errors."""
+
+    PROJECTION = 2e-5  # values of a splat: about 300 operations, and determinants with cancellation
+    CONIC = 1e-4  # a conic, or a gradient of the projection, relative to its norm
+    DEPTH = 1e-6  # the depth of a splat
+    GRADIENT = 2e-4  # a gradient through blending, relative to its norm
+    SUM = 1e-5  # a sum of a few hundred positive values
+    LOSS_GRADIENT = 2e-4  # relative to the largest value of the gradient
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ def judge(
 ) -> Verdict:
     """Return the verdict on a device from the results of each schedule, and of the checks that run once per device.
 
-    default: the schedule that the device uses by default.  device_results: the results of the latter.
+    default: the schedule that the device uses by default.  device_results: results of the checks that run once.
     """
     verdict = _judge_failures(default, schedules, device_results)
     if verdict.usable and any(
@@ -80,7 +80,7 @@ def _judge_default(failures: Mapping[str, list[str]], other_failures: list[str])
     faults = [f"with the {name} schedule, {texts[0]}" for name, texts in failures.items() if texts] + other_failures
     if not faults:
         return Verdict(True, "use it")
-    return Verdict(True, f"use it; a failure does not affect training: {faults[0]}", REPORT)
+    return Verdict(True, f"use it; this failure does not affect training: {faults[0]}", REPORT)
 
 
 def _is_bitonic(result: CheckResult) -> bool:
@@ -238,7 +238,7 @@ def _is_due(schedule: str, report: DeviceReport) -> bool:
     Other devices do not benefit from `wide`, and some compilers need many minutes for its vectors.
     """
     if schedule == "simt16":
-        return report.info.group >= 256  # an item of the group for each pixel of a tile
+        return report.info.group >= 256  # one work-item for each pixel of a tile
     if schedule == "simt" or report.default == "wide":
         return True
     return report.info.kind == "CPU" and bool(report.failures["simt"])

@@ -121,7 +121,7 @@ class BlendWeight(Statistic):
 StatisticName = Annotated[str, VariantName(Statistic, lambda cls: cls.components == 1)]
 
 
-# Statistics that the update of parameters can add to, with its bit for them (adam.cl).
+# Statistics that the parameter update can accumulate, each with its bit in adam.cl.
 _MEAN2D, _SEEN, _NORM, _ABS_NORM = (
     int(constants("adam.cl")[f"OUTPUT_{name}"]) for name in ("MEAN2D", "SEEN", "NORM", "ABS_NORM")
 )
@@ -195,7 +195,7 @@ class SplatStats:
     def add(self, gradients: ViewGradients, grad_mean2d: Array, after_update: bool = False) -> None:
         """Add a view to all statistics.  grad_mean2d: [2, S] px⁻¹.
 
-        after_update: except to those to which `Adam.update` added it.
+        after_update: skip the statistics to which `Adam.update` has already added the view.
         """
         gaussians, frame = self.gaussians, gradients.frame
         names = [name for name in self.columns if not (after_update and name == self._in_update)]

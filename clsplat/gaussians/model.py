@@ -276,8 +276,8 @@ class Model:
     def with_origin(self, origin: NDArray[np.floating]) -> "Model":
         """Return the model with its means relative to another origin, [3] world coordinates.
 
-        Many formats and programs lose the origin.  The means of a model without one are therefore assumed to be
-        relative to `origin` already if they are closer to zero than to `origin`.
+        Many formats and programs lose the origin.  If a model has none, and its means are closer to zero than to
+        `origin`, they are assumed to be relative to `origin` already.
         """
         if not self.origin.any() and np.any(origin) and len(self):
             center = np.median(self.means, axis=0).astype(np.float64)
@@ -328,7 +328,7 @@ class Model:
         if is_float32_precise(means, self.log_scales):
             means = means.astype(np.float32)
         elif writing_format(path).keeps_all:
-            LOG.info("%s: x, y, and z are doubles, since floats are too coarse for world coordinates", path)
+            LOG.info("%s: x, y, and z are written as doubles, since floats are too coarse for world coordinates", path)
         else:
             raise ConfigError(
                 f"{path}: world coordinates around {format_position(self.origin)} exceed the precision of this format; "

@@ -124,7 +124,7 @@ class FieldShape(Settings):
     """The unit of all lengths in the field, in scene units; `auto`: the median distance of the training cameras from
     the point that they look at, divided by 4.03, so that it is 1 for the Blender scenes.  A run writes this length."""
     unit_auto: UnitLength | None = None
-    """Written by a run: the length that `auto` chose.  If `unit` still equals it, other photos change both."""
+    """Written by a run: the length that `auto` chose.  While `unit` equals it, a run on other photos chooses again."""
     near: Annotated[float, Field(ge=1e-6, le=MAX_DISTANCE)] = 2.0
     """Depth at which the samples of a ray start, in units of `unit`; 2 for the Blender scenes."""
     far: Annotated[float, Field(gt=0, le=MAX_DISTANCE)] = 6.0

@@ -59,7 +59,7 @@ def apply(data: dict[str, Any], text: str, root: type[BaseModel]) -> KeyPath:
     if not isinstance(node.data, dict):
         raise NoSuchKey(text, f"{quote(node.key_path[-1])} has no keys")
     if not node.key_path and last not in root.model_fields:
-        raise NoSuchKey(text, f"no key {quote(last)} at the top of a pipeline")
+        raise NoSuchKey(text, f"no key {quote(last)} at the top level of a pipeline")
     node.data[last] = with_tags(new_value, node.annotation(last))
     return (*node.key_path, last)
 

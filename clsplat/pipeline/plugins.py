@@ -109,7 +109,7 @@ def differences(digests: Mapping[str, str]) -> list[str]:
             faults.append(f"needs the plug-in '{name}', which is not loaded; use --plugin {name}.py")
         elif _loaded[name].digest != digest:
             path, new_digest = _loaded[name].path, _loaded[name].digest
-            change = f"{path} has changed since (sha256 {new_digest[:12]}, was {digest[:12]})"
+            change = f"{path} has changed (sha256 {new_digest[:12]}, was {digest[:12]})"
             faults.append(f"needs the plug-in '{name}', but {change}; use the earlier file")
     return faults
 

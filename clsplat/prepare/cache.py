@@ -91,7 +91,7 @@ def prepare(
         with logging_counts_as_debug():  # each step logs its own progress
             counter.reach(i)
         with _lock_result(planned_step) if planned_step.reason else nullcontext():
-            if planned_step.reason and _find_fault(planned_step.folder):  # another process may have made it meanwhile
+            if planned_step.reason and _find_fault(planned_step.folder):  # unless another process made the result
                 with stage(planned_step.step.stage):
                     _run_step(planned_step, source, root)
             else:
@@ -180,7 +180,7 @@ def _run_step(planned_step: PlannedStep, source: Path, root: Path) -> None:
             raise write_error(planned_step.folder, error) from error
         if (
             isinstance(error, DataError) and str(source.resolve()) != planned_step.origin
-        ):  # name the user's folder, not a result
+        ):  # name the user's folder instead of the folder of a result
             raise DataError(str(error).replace(str(source.resolve() / IMAGES), planned_step.origin)) from error
         raise
     LOG.info("%s (%.0f s)", planned_step.step.summary(result), seconds)
@@ -236,7 +236,7 @@ def _find_reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
     newest = max(results, key=lambda pair: pair[0])[1]
     for name, value in step.model_dump(mode="json").items():
         if newest["settings"].get(name) != value:
-            return f"{name} is {value}, was {newest['settings'].get(name)}"
+            return f"{name} changed from {newest['settings'].get(name)} to {value}"
     return "its input has changed" if newest.get("inputs") != inputs else "the step itself has changed"
 
 

@@ -12,7 +12,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.signals import stopping_on_signals
 
 DATABASE, IMAGES, PAIRS, MODEL = "database.db", "images", "pairs.txt", "sparse"
-MATCHING = "matching.json"  # settings of match_features, which further attempts to place photographs reuse
+MATCHING = "matching.json"  # settings of match_features, which further attempts to register photographs reuse
 COUNT_PAIRS = """
 import sqlite3, sys
 with sqlite3.connect(sys.argv[1], uri=True, timeout=0.1) as connection:

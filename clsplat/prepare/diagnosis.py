@@ -1,4 +1,4 @@
-"""Explain why photographs could not be placed, from their features and matches."""
+"""Explain why photographs could not be registered, from their features and matches."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -17,8 +17,8 @@ from clsplat.scene.quality import is_blurred, measure_sharpness
 
 FEW_FEATURES = 300  # per photograph: a plain wall has tens, a garden thousands
 MIN_TEXTURED = 1000  # features of a photograph with enough texture
-FEW_MATCHES = 30  # matches with the points of a model; COLMAP does not place a photograph that has fewer
-MAX_COMPARED = 15  # number of placed photographs from which the typical sharpness is computed
+FEW_MATCHES = 30  # matches with the points of a model; COLMAP does not register a photograph with fewer
+MAX_COMPARED = 15  # number of registered photographs from which the typical sharpness is computed
 
 
 @dataclass
@@ -50,8 +50,8 @@ class MatchGraph:
     def has_unrelated_photographs(self) -> bool:
         """Return whether most photographs match no other photograph, although they have many features.
 
-        Denser features do not help then: photographs of one scene have at least some matches, even if too few to place
-        a camera.  Photographs of plain surfaces have few features, and denser features may help.
+        If so, denser features do not help: photographs of one scene have at least some matches, even if too few to
+        register a camera.  Photographs of plain surfaces have few features, and denser features may help.
         """
         is_textured = median(self.features.values()) >= MIN_TEXTURED
         return is_textured and len(self.groups(1)[0]) < len(self.features) / 2
@@ -75,7 +75,7 @@ def connected_groups(names: Iterable[str], pairs: Iterable[tuple[str, str]]) -> 
 
 
 def diagnose(graph: MatchGraph) -> str:
-    """Return the likely reason why no photograph could be placed, and a remedy."""
+    """Return the likely reason why no photograph could be registered, and a remedy."""
     count = round(median(graph.features.values()))
     if count < FEW_FEATURES:
         problem = f"half of them have {f'at most {count}' if count else 'no'} features"
@@ -88,7 +88,7 @@ def diagnose(graph: MatchGraph) -> str:
     groups = graph.groups(FEW_MATCHES)
     if len(groups[0]) < max(MIN_PHOTOGRAPHS, len(graph.features) / 2):
         return f"{_describe_groups(graph, groups)}; take photos of one scene, with more overlap"
-    return "take more sharp photos, a step apart, of a textured, static scene"
+    return "take more photos, sharp and a step apart, of a textured, static scene"
 
 
 def _describe_groups(graph: MatchGraph, groups: Sequence[list[str]]) -> str:
@@ -102,7 +102,7 @@ def _describe_groups(graph: MatchGraph, groups: Sequence[list[str]]) -> str:
     return f"they do not connect: {pluralize(count, 'group')} with good matches, the largest with {first_group}{suffix}"
 
 
-def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str, str]:
+def explain_unregistered(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str, str]:
     """Return the likely reason why each photograph is missing from the first model, by the name of the photograph.
 
     models: the names of the photographs in each model, the largest model first.
@@ -121,9 +121,9 @@ def explain_unplaced(graph: MatchGraph, models: Sequence[set[str]]) -> dict[str,
     return reasons
 
 
-def _explain(graph: MatchGraph, name: str, placed_names: set[str], typical_sharpness: NDArray[np.float64]) -> str:
+def _explain(graph: MatchGraph, name: str, registered_names: set[str], typical_sharpness: NDArray[np.float64]) -> str:
     matches = graph.matches[name]
-    counts = {other: count for other, count in matches.items() if other in placed_names}
+    counts = {other: count for other, count in matches.items() if other in registered_names}
     if graph.features[name] < FEW_FEATURES:
         return f"only {pluralize(graph.features[name], 'feature')}: blurred, dark, or a plain surface"
     is_blurry = is_blurred(graph.measure_sharpness(name), typical_sharpness)

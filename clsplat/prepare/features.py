@@ -42,7 +42,7 @@ LEVELS = 512  # scale of RootSIFT values, as COLMAP stores them; values above 25
 class FeatureOptions:
     """Settings of the feature detector."""
 
-    long_side: int = 1600  # px; larger images are reduced
+    long_side: int = 1600  # px; larger images are downscaled
     count: int = 12288  # maximum number of features per image
     contrast: float = 0.02  # threshold, as a fraction of the gray range; the default of COLMAP, and 0.04 in Lowe 2004
     min_side: int = 0  # px; images whose long side is shorter are enlarged to twice their size
@@ -136,7 +136,7 @@ def detect_sift(pixels: NDArray[np.uint8], options: FeatureOptions) -> tuple[NDA
 
 
 def _register(pycolmap: ModuleType, out: Path, groups: Sequence[Sequence[str]], camera_model: CameraModel) -> None:
-    """Write the images to a new database, with one camera per group, whose focal length is from EXIF."""
+    """Write the images to a new database, with one camera per group.  Focal lengths come from EXIF if it has them."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = camera_model
     camera_ids: Mapping[str, int] = {name: i for i, group in enumerate(groups, 1) for name in group}

@@ -232,20 +232,20 @@ def warnings_for(statistics: Mapping[str, Any]) -> list[str]:
         examples = first_few([f"{name} ({reasons[name]})" if name in reasons else name for name in missing_names])
         alternative = "" if statistics.get("denser_tried") else ", or find more features (find_features.long_side)"
         warnings.append(
-            f"{len(missing_names)} of {statistics['registered'] + len(missing_names)} photos could not be placed and "
-            f"are not used: {examples}; to place them, add photos from viewpoints in between{alternative}"
+            f"{len(missing_names)} of {statistics['registered'] + len(missing_names)} photos could not be registered "
+            f"and are not used: {examples}; to register them, add photos from viewpoints in between{alternative}"
         )
     if sizes := statistics.get("other_models"):
         counts = ", ".join([*map(str, sizes[:-1]), pluralize(sizes[-1], "photo")])
         warnings.append(
-            f"only the largest model is used, without {pluralize(len(sizes), 'smaller model')} of {counts}: add "
-            "photos that connect them"
+            f"only the largest model is used, without {pluralize(len(sizes), 'smaller model')} of {counts}; add "
+            "photos that connect the models"
         )
     return warnings
 
 
 def summarize_placement(statistics: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a sentence with the number of placed photographs, the mean reprojection error, and the unused photographs.
+    """Return a sentence with the number of registered photos, the mean reprojection error, and the unused photos.
 
     statistics: the result of `read_statistics`.  Returns "" if they are incomplete.
     """
@@ -254,10 +254,10 @@ def summarize_placement(statistics: Mapping[str, Mapping[str, Any]]) -> str:
         read_errors = statistics.get("find_features", {}).get("damaged", {})
         faults = [f"{name} ({reason})" for name, reason in read_errors.items()]
         reasons = cameras.get("reasons", {})
-        unplaced = [f"{name} ({reasons[name]})" if name in reasons else str(name) for name in cameras["not_registered"]]
-        count, unused_photos = int(cameras["registered"]), [*faults, *unplaced]
+        missing = [f"{name} ({reasons[name]})" if name in reasons else str(name) for name in cameras["not_registered"]]
+        count, unused_photos = int(cameras["registered"]), [*faults, *missing]
         error = float(cameras["error_px"])
-        text = f"{count} of {count + len(unused_photos)} photos placed, reprojection error {error:.2f} px"
+        text = f"{count} of {count + len(unused_photos)} photos registered, reprojection error {error:.2f} px"
     except (AttributeError, KeyError, TypeError, ValueError):
         return ""
     return text + (f"; left out: {first_few(unused_photos)}" if unused_photos else "")

@@ -1,4 +1,4 @@
-"""Find cameras and points from matches with pycolmap, in several attempts until all photographs have cameras.
+"""Find cameras and points from matches with pycolmap, and try again while photographs are not registered.
 
 The model with the most photographs is kept; of equal models, the earliest.
 """
@@ -27,7 +27,7 @@ from clsplat.prepare.database import (
     read_verified_pairs,
     require_pycolmap,
 )
-from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unplaced
+from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unregistered
 from clsplat.prepare.features import FeatureOptions, add_features
 from clsplat.prepare.gather import MIN_PHOTOGRAPHS, link, log_warnings
 from clsplat.prepare.matching import Pairing, expand_pairs, match_database, match_pairs
@@ -35,7 +35,7 @@ from clsplat.prepare.rotation_only import explain_missing_depth
 
 LOG = logging.getLogger("clsplat")
 Mapper = Literal["incremental", "global"]
-ENOUGH = 0.9  # fraction of the photographs that must be placed to skip the attempts with denser features
+ENOUGH = 0.9  # fraction of the photographs that must be registered to skip the attempts with denser features
 DENSE, ENLARGED, WIDER = (f".{name}.{DATABASE}" for name in ("dense", "enlarged", "wider"))
 DENSER = FeatureOptions(long_side=2400, count=16384, contrast=0.01)
 SMALL = 1200  # px, long side; smaller photographs are enlarged to twice their size if denser features are not enough
@@ -43,7 +43,7 @@ FAILURES = (DataError, RuntimeError, ValueError, cv2.error)  # pycolmap raises t
 TWO_VIEWS = 2  # track length of points that COLMAP drops from its models
 PAIR_ERROR = 1.0  # px, mean reprojection error; strict, since the two rays of any pair of features nearly meet
 PAIR_ANGLE = 1.5  # degrees between two rays, as COLMAP requires for all points
-LOOSE = {  # COLMAP's defaults: 100 matches, 16 degrees, 30 matches, a quarter of them
+LOOSE = {  # COLMAP's defaults: 100 matches, 16 degrees, 30 matches, 0.25
     "init_min_num_inliers": 50,
     "init_min_tri_angle": 5.0,
     "abs_pose_min_num_inliers": 15,
@@ -58,7 +58,7 @@ class Attempt:
     label: str  # describes the attempt in the log
     mapper: Mapper = "incremental"
     is_loose: bool = False  # accept fewer matches and smaller angles
-    has_more_pairs: bool = False  # match unplaced photographs with more others, unless all pairs were matched
+    has_more_pairs: bool = False  # match unregistered photographs with more photographs, unless all pairs were matched
     is_dense: bool = False  # find more features, and match the same pairs
     is_enlarged: bool = False  # find the features of small photographs at twice their size, unless none is small
 
@@ -87,11 +87,11 @@ def map_cameras(
     attempts: int = MAX_ATTEMPTS,
     min_track_length: int = 3,
 ) -> dict[str, Any]:
-    """Place cameras and points in at most `attempts` attempts, and write the largest model to sparse/0.
+    """Find cameras and points in at most `attempts` attempts, and write the largest model to sparse/0.
 
     Returns statistics for the log.  `mapper: global` is faster for many photographs; more than one thread is faster but
     not bit-identical.  min_track_length: the number of photographs in which a point must be visible, 2 or 3.
-    Raises DataError, with the likely reason, when no attempt places three photographs.
+    Raises DataError, with the likely reason, when no attempt registers three photographs.
     """
     pycolmap = require_pycolmap()
     link(source / IMAGES, out / IMAGES)
@@ -101,9 +101,9 @@ def map_cameras(
         raise DataError(f"{source / IMAGES}: the photos {reason}")
     models, best, extra_pairs, count = list[Any](), (first := Attempt("as set", mapper)), list[tuple[str, str]](), 0
     for attempt in (first, *_retries(pycolmap, source / DATABASE)):
-        placed_count = models[0].num_reg_images() if models else 0
-        missing = set(names) - _placed_names(*models[:1])
-        if count == attempts or not missing or (attempt.is_dense and placed_count >= ENOUGH * len(names)):
+        registered_count = models[0].num_reg_images() if models else 0
+        missing = set(names) - _registered_names(*models[:1])
+        if count == attempts or not missing or (attempt.is_dense and registered_count >= ENOUGH * len(names)):
             break
         if attempt.is_dense and not models and graph.has_unrelated_photographs():
             break  # denser features would not help: most photographs have nothing in common
@@ -111,7 +111,8 @@ def map_cameras(
             if attempt.has_more_pairs and not (extra_pairs := expand_pairs(source / DATABASE, missing)):
                 continue
             if attempt is not first:
-                LOG.info("placed %d of %d photos; trying again with %s", placed_count, len(names), attempt.label)
+                counts = registered_count, len(names)
+                LOG.info("registered %d of %d photos; trying again with %s", *counts, attempt.label)
             count += 1
             candidates = _run_attempt(source, out, attempt, threads, models[:1], extra_pairs)
             if attempt.has_more_pairs:
@@ -123,26 +124,27 @@ def map_cameras(
             if not attempt.has_more_pairs:
                 break
             extra_pairs, candidates = [], []
-        if candidates and candidates[0].num_reg_images() > placed_count:
+        if candidates and candidates[0].num_reg_images() > registered_count:
             models, best = candidates, attempt
     if not models:
-        raise DataError(f"{source / IMAGES}: the {len(names)} photos could not be placed: {diagnose(graph)}")
-    database, placed_names = best.database_path(source, out), _placed_names(models[0])
-    if reason := explain_missing_depth(pycolmap, database, placed_names):
-        raise DataError(f"{source / IMAGES}: the {len(placed_names)} of {len(names)} photos that were placed {reason}")
+        raise DataError(f"{source / IMAGES}: the {len(names)} photos could not be registered: {diagnose(graph)}")
+    database, registered_names = best.database_path(source, out), _registered_names(models[0])
+    if reason := explain_missing_depth(pycolmap, database, registered_names):
+        count_text = f"{len(registered_names)} of {len(names)}"
+        raise DataError(f"{source / IMAGES}: the {count_text} photos that were registered {reason}")
     if best.is_dense:
         graph = MatchGraph.from_database(pycolmap, database, source / IMAGES)
     if min_track_length == TWO_VIEWS:
         models[0] = triangulate_pairs(models[0], database, out, threads)
     result = {**_write_best(models, out, names), "attempt": best.label, "denser_tried": (out / DENSE).exists()}
-    result["reasons"] = explain_unplaced(graph, [_placed_names(model) for model in models])
+    result["reasons"] = explain_unregistered(graph, [_registered_names(model) for model in models])
     _remove_hidden(out)
     log_warnings(result)
     return result
 
 
 def _retries(pycolmap: ModuleType, database: Path) -> list[Attempt]:
-    """Return the attempts after the first one that make a difference for photographs of these sizes."""
+    """Return the attempts after the first, without those that make no difference for photographs of these sizes."""
     has_small = read_min_long_side(pycolmap, database) < SMALL
     return [attempt for attempt in RETRIES if has_small or not attempt.is_enlarged]
 
@@ -173,14 +175,14 @@ def _run_attempt(
     if attempt.is_loose:
         options.mapper.mergedict(LOOSE)
     pycolmap.set_random_seed(0)
-    with raising_data_error(source / IMAGES, "place the cameras"):
+    with raising_data_error(source / IMAGES, "register the photos"):
         run_mapper = pycolmap.global_mapping if is_global else pycolmap.incremental_mapping
-        counter = ItemCounter("photos placed", len(read_image_names(pycolmap, database)))
+        counter = ItemCounter("photos registered", len(read_image_names(pycolmap, database)))
 
-        def on_placed() -> None:
+        def on_registered() -> None:
             counter.reach(min(max(2, counter.done) + 1, counter.total))
 
-        arguments: dict[str, Any] = {} if is_global else {"next_image_callback": on_placed}
+        arguments: dict[str, Any] = {} if is_global else {"next_image_callback": on_registered}
         if attempt.is_loose and not attempt.is_dense and previous:
             (out / ".before").mkdir(exist_ok=True)
             previous[0].write(str(out / ".before"))
@@ -192,9 +194,10 @@ def _run_attempt(
 
 
 def _fill_database(source: Path, out: Path, attempt: Attempt, pairs: Sequence[tuple[str, str]]) -> Path:
-    """Write the features and matches of an attempt to its database; return the path.  Continue an interrupted call.
+    """Write the features and matches of an attempt to its database; return the path.
 
-    The pairs depend only on the first database and the previous model, so they are the same after an interruption.
+    Continues an interrupted call: the pairs depend only on the first database and the previous model, so they are
+    still the same.
     """
     database, pairing = attempt.database_path(source, out), Pairing.read(source)
     if not database.exists():
@@ -216,20 +219,20 @@ def _write_best(models: Sequence[Any], out: Path, names: Sequence[str]) -> dict[
     best = models[0]
     (out / MODEL / "0").mkdir(parents=True, exist_ok=True)
     best.write(str(out / MODEL / "0"))
-    placed_names, new_counts, covered_names = _placed_names(best), list[int](), set[str]()
+    registered_names, new_counts, covered_names = _registered_names(best), list[int](), set[str]()
     for model in models:
-        new_counts.append(len(_placed_names(model) - covered_names))
-        covered_names |= _placed_names(model)
+        new_counts.append(len(_registered_names(model) - covered_names))
+        covered_names |= _registered_names(model)
     return {
-        "registered": len(placed_names),
-        "not_registered": [name for name in names if name not in placed_names],
+        "registered": len(registered_names),
+        "not_registered": [name for name in names if name not in registered_names],
         "other_models": [count for count in new_counts[1:] if count],  # photographs that are in no larger model
         "points": best.num_points3D(),
         "error_px": round(best.compute_mean_reprojection_error(), 3),
     }
 
 
-def _placed_names(*models: Any) -> set[str]:
+def _registered_names(*models: Any) -> set[str]:
     return {model.images[image_id].name for model in models for image_id in model.reg_image_ids()}
 
 

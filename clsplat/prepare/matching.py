@@ -128,11 +128,11 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
         _match_pairs(database, new_pairs, _make_options(pycolmap, threads))
 
 
-def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
-    """Return pairs that contain an `unplaced` photograph and that `match_database` has not matched.
+def expand_pairs(database: Path, unregistered: Set[str]) -> list[tuple[str, str]]:
+    """Return pairs that contain an `unregistered` photograph and that `match_database` has not matched.
 
-    The pairs at most double the number of matched pairs: if there are more candidates, each unplaced photograph is
-    paired only with the most similar photographs, at least one.
+    The pairs at most double the number of matched pairs: if there are more candidates, each unregistered photograph
+    is paired only with the most similar photographs, at least one.
     """
     pycolmap = require_pycolmap()
     with open_database(pycolmap, database) as db:
@@ -145,28 +145,28 @@ def expand_pairs(database: Path, unplaced: Set[str]) -> list[tuple[str, str]]:
                 "'%s': COLMAP's pair lists do not allow spaces in names, so no further pairs are matched", bad_names[0]
             )
             images = [image for image in images if not _has_space(image.name)]
-        is_unplaced = [image.name in unplaced for image in images]
+        is_unregistered = [image.name in unregistered for image in images]
         candidates = [
             (i, j)
             for i, j in combinations(range(len(images)), 2)
-            if (is_unplaced[i] or is_unplaced[j])
+            if (is_unregistered[i] or is_unregistered[j])
             and not db.exists_two_view_geometry(images[i].image_id, images[j].image_id)
         ]
         if len(candidates) > max_pairs:
             similarities = compute_similarities(_read_descriptors(db, images))
             candidates = _select_closest_pairs(
-                candidates, similarities, is_unplaced, max(1, max_pairs // sum(is_unplaced))
+                candidates, similarities, is_unregistered, max(1, max_pairs // sum(is_unregistered))
             )
     return [(images[i].name, images[j].name) for i, j in candidates]
 
 
 def _select_closest_pairs(
-    pairs: Sequence[tuple[int, int]], similarities: NDArray[np.float64], is_unplaced: Sequence[bool], count: int
+    pairs: Sequence[tuple[int, int]], similarities: NDArray[np.float64], is_unregistered: Sequence[bool], count: int
 ) -> list[tuple[int, int]]:
-    """Return the pairs of each unplaced photograph with the `count` most similar photographs."""
-    counts, closest = [0] * len(is_unplaced), []
+    """Return the pairs of each unregistered photograph with the `count` most similar photographs."""
+    counts, closest = [0] * len(is_unregistered), []
     for i, j in sorted(pairs, key=lambda pair: -similarities[pair]):
-        if any(is_unplaced[k] and counts[k] < count for k in (i, j)):
+        if any(is_unregistered[k] and counts[k] < count for k in (i, j)):
             closest.append((i, j))
             counts[i] += 1
             counts[j] += 1
@@ -209,7 +209,7 @@ def _has_space(name: str) -> bool:
 
 @contextmanager
 def _count_pairs(database: Path, pairs: int) -> Iterator[None]:
-    """Report the number of pairs that pycolmap has matched in the block as progress."""
+    """While the block runs, report as progress how many pairs pycolmap has matched."""
     counter = ItemCounter("pairs matched", pairs)
     with polled(counter, lambda: count_matched_pairs(database)):
         yield

@@ -21,7 +21,7 @@ from clsplat.prepare.diagnosis import FEW_MATCHES, connected_groups
 
 MAX_PAIRS = 120  # pairs to test, spaced evenly after sorting by the number of matches
 MAX_RESIDUAL = 3.0  # px: largest residual of a match that a homography explains, and largest motion of a static point
-MIN_EXPLAINED = 0.9  # fraction of the matches of a pair, and of the pairs
+MIN_EXPLAINED = 0.9  # fraction of the matches of a pair that fit its homography, and of the pairs that fit a rotation
 FOCALS = np.geomspace(0.4, 4.0, 47)  # focal lengths to try, as fractions of the longer side
 MAX_DEVIATION = 0.1  # of K⁻¹ H K from a rotation, relative to its deviation from the identity
 REMEDY = "so depth cannot be estimated; walk around the scene, taking a photo every step"

@@ -115,7 +115,8 @@ class MatchFeatures(Step):
     matching: Matching = "auto"
     """Pairs of photos to match; auto: exhaustive, or vocabulary for more than 200 photos."""
     neighbors: Positive = 10
-    """Number of photos with which each photo is matched, unless matching is exhaustive."""
+    """Number of photos with which each photo is matched: the next ones by name, or twice as many similar ones
+    (vocabulary).  Not used by exhaustive matching."""
     threads: Positive = 1
     """Number of threads; more than one is faster, but results are not always bit-identical."""
 
@@ -132,8 +133,8 @@ class MatchFeatures(Step):
 class MapCameras(Step):
     """Find cameras and points from matches.
 
-    If photographs cannot be placed, the step tries again, in this order: with looser settings, with more pairs (unless
-    `match_features` matched all of them), and with more features.
+    If photographs cannot be registered, the step tries again, in this order: with looser settings, with more pairs
+    (unless `match_features` matched all of them), and with more features.
     """
 
     version: ClassVar[int] = 4  # enlarges small photos if denser features are not enough
@@ -143,15 +144,15 @@ class MapCameras(Step):
     stage: Literal["map_cameras"] = "map_cameras"
 
     mapper: Mapper = "incremental"
-    """How cameras are placed in the first attempt: one after another (incremental) or all at once (global)."""
+    """COLMAP mapper of the first attempt: one camera after another (incremental) or all at once (global)."""
     threads: Positive = 1
     """Number of threads; more than one is faster, but results are not bit-identical."""
     attempts: Annotated[int, Field(ge=1, le=MAX_ATTEMPTS)] = MAX_ATTEMPTS
     """Maximum number of attempts.  The second accepts smaller angles and fewer matches; the third matches more pairs of
-    the unplaced photos, unless all pairs were matched; the others find more features."""
+    the unregistered photos, unless all pairs were matched; the others find more features."""
     min_track_length: Literal[2, 3] = 3
-    """Number of photos in which a point must be visible.  COLMAP drops points visible in only two; keeping them
-    gave 2.5 times as many points on one scene."""
+    """Minimum number of photos in which a point must be visible.  COLMAP drops points visible in only two; keeping
+    them gave 2.5 times as many points on one scene."""
 
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return map_cameras(source, out, self.mapper, self.threads, self.attempts, self.min_track_length)

@@ -72,7 +72,7 @@ def _downscale(view: View, long_side: int | None) -> View:
 
 
 def _png_names(names: list[str]) -> list[str]:
-    """Return the names with the suffix .png, or append .png to the original names where the results would be equal."""
+    """Return the names with the suffix replaced by .png.  Names that would become equal get .png appended instead."""
     candidates = [Path(name).with_suffix(".png").as_posix() for name in names]
     counts = Counter(candidates)
     unique_names = [png if counts[png] == 1 else f"{name}.png" for png, name in zip(candidates, names, strict=True)]

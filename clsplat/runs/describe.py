@@ -71,7 +71,7 @@ def describe(
     measures, refusal_lines = _expect_measures(pipeline, names)
     lines += [*refusal_lines, *(f"  adapt          {reason}" for reason in pipeline.reasons)]
     if undecided_keys := pipeline.undecided:
-        lines.append(f"  adapt          the photos decide {', '.join(undecided_keys)}")
+        lines.append(f"  adapt          chosen from the photos: {', '.join(undecided_keys)}")
     active_stages = [stage for stage in pipeline.stages if _has_work(stage, run)]
     lines += [f"  {stage.stage:<14} {_describe_stage(stage, run)}".rstrip() for stage in active_stages]
     lines += _describe_offloading(pipeline, run) if run else []

@@ -146,7 +146,8 @@ def _check_files(state: RunState, cells: dict[str, RunState], expect_all: bool =
     """
     out, names, status, sums = state.out, state.names, state.status, state.sums or {}
     settings: dict[str, Any] = {}
-    has_ended = CHECKSUMS in names and (PIPELINE in sums or not sums)  # while a run continues, it lists other files
+    # while a run continues, checksums.json does not list pipeline.yaml
+    has_ended = CHECKSUMS in names and (PIPELINE in sums or not sums)
     is_done = expect_all or state.phase is Phase.DONE or (not status and has_ended)
     check_one = partial(check_file, out)
     yield check_one(PIPELINE, partial(check_settings, state, settings))

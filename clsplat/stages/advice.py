@@ -18,16 +18,16 @@ from clsplat.training.run import Run
 MAX_LINES = 5
 MAX_RENDERED_VIEWS = 24  # training views, evenly spaced
 MAX_NAMES = 3  # of photos in a sentence
-OUTLIER_DB = 5.0  # below the median of the views
+OUTLIER_DB = 5.0  # dB below the median PSNR of the views
 MIN_EXPOSURE_GAIN = 1.0  # dB, by a gain per channel and photo
 LOW_PSNR = 24.0  # dB, mean of the training views
 TRANSIENTS_START = 1 / 3  # of the training
 FEW_PHOTOS = 24  # for training
-AIMED_COSINE = 0.8  # mean cosine between camera axes and the directions to the center: cameras look at one point
-MIN_OFFSET = 0.3  # of the distance to the center, perpendicular to the upward axis: cameras surround the center
+AIMED_COSINE = 0.8  # mean cosine of view directions to the center, above which the cameras look at one point
+MIN_OFFSET = 0.3  # median horizontal distance / distance to the center, above which the cameras surround the center
 MIN_GAP = 40.0  # degrees around the center without a photo
 OPEN_SIDE_DEGREES = 120.0  # degrees; a wider gap is a side that was left out on purpose
-MIN_GAP_RATIO = 3.0  # to the median gap
+MIN_GAP_RATIO = 3.0  # of the widest gap to the median gap
 
 
 def collect_advice(run: Run, is_overfit: bool) -> list[str]:
@@ -101,8 +101,7 @@ def advise_on_test_views(psnr: Mapping[str, float], rerun: str) -> Iterator[str]
     """Yield advice from the PSNR of test views.  psnr: dB, by the name of the view."""
     if names := find_outliers(psnr):
         yield (
-            f"{_join_names(names)}: much worse than the other test views; add photos of what is visible there, then "
-            f"`{rerun}`"
+            f"{_join_names(names)}: much worse than the other test views; add photos of what they show, then `{rerun}`"
         )
 
 

@@ -65,7 +65,7 @@ def try_sweep(run: Run, count: int) -> PointCloud | None:
     """Return the points of `sweep_photos`, or None, with a warning, if there are too few."""
     points = sweep_photos(run, count)
     if len(points) < MIN_POINTS:
-        remedy = "photos taken closer together give more"
+        remedy = "photos taken closer together give more points"
         LOG.warning("the plane sweep found only %d points; starting from random points; %s", len(points), remedy)
         return None
     return points
@@ -90,10 +90,10 @@ class Init(Stage):
     """Make isotropic Gaussians as large as the mean distance to the three nearest neighbors (Kerbl et al. 2023).
 
     `source: auto` uses the scene's points.  If the scene has fewer than `min_points` and opaque photos, points of a
-    plane sweep are added.  A scene without points uses a plane sweep, or, if its photos have transparent pixels, what
-    `transparent` selects: random points in a box around the point that the cameras look at, as published, or points
-    on the visual hull in that box.  `source: points+sweep` always adds points of a sweep, except at pixels that show a
-    point of the scene or are transparent.
+    plane sweep are added.  If the scene has no points, `auto` uses a plane sweep for opaque photos, and the source in
+    `transparent` for photos with transparent pixels.  `random` draws points in a box around the point that the cameras
+    look at, as published; `hull` samples the visual hull in that box.  `points+sweep` always adds points of a sweep,
+    except at pixels that are transparent or already show a point of the scene.
     """
 
     stage: Literal["init"] = "init"

@@ -1,5 +1,5 @@
-// Cameras: x right, y down, z forward.  A camera is {rotation: [9], eye: [3], lens: [6]}: world to camera by rows, and
-// lens = [fx, fy, cx, cy, width, height] of its image, px.
+// Cameras: x right, y down, z forward.  A camera is {rotation: [9], eye: [3], lens: [6]}: the row-major rotation from
+// world to camera, the camera center, and lens = [fx, fy, cx, cy, width, height] of its image, px.
 
 const add = (a, b, f = 1) => a.map((v, i) => v + f * b[i]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -71,9 +71,9 @@ function fitToCanvas(lens, width, height) {
   return {enlarged, left: (width - enlarged * lens[4]) / 2, top: (height - enlarged * lens[5]) / 2};
 }
 
-// The values of a camera on a canvas for the shaders.  exact: clamp rays as `clsplat render` does for the camera's
-// image; otherwise clamp them beyond the canvas, which shows more than that image.  native: the focal length with a
-// scale of 1.
+// The uniforms of the shaders for a camera and a canvas.  exact: clamp rays outside the camera's image, as
+// `clsplat render` does; otherwise clamp rays outside the canvas, which shows more than that image.  native: the focal
+// length, px, at which the scale `enlarged` is 1.
 function makeFrame(camera, width, height, exact, native = 1) {
   const [fx, fy, cx, cy, w, h] = camera.lens, {enlarged, left, top} = fitToCanvas(camera.lens, width, height);
   const intrinsics = [fx * enlarged, fy * enlarged, cx * enlarged + left, cy * enlarged + top];
@@ -89,7 +89,7 @@ function makeFrame(camera, width, height, exact, native = 1) {
 const formatCamera = camera => [camera.eye, quaternion(camera.rotation), camera.lens]
   .map(part => part.map(v => +v.toPrecision(8)).join(",")).join(";");
 
-// Read the camera, and the timestamp if there is one, from the fragment (#) of an address; null if it has no camera.
+// Read the camera, and the timestamp if there is one, from the fragment (#) of a URL; null if it has no camera.
 function parseCamera(text) {
   const parts = text.replace(/^#/, "").split(";").map(part => part.split(",").map(Number));
   if (![3, 4].includes(parts.length) || parts.some((part, i) => part.length !== [3, 4, 6, 1][i])) return null;

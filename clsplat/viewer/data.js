@@ -13,7 +13,7 @@ function* decodePieces(text) {
 }
 
 async function inflate(text) {
-  if (!self.DecompressionStream) throw Error("this browser is too old: it has no DecompressionStream");
+  if (!self.DecompressionStream) throw Error("this browser is too old: it has no DecompressionStream; update it");
   const stream = new DecompressionStream("gzip"), writer = stream.writable.getWriter();
   const writing = (async () => {
     for (const bytes of decodePieces(text)) await writer.write(bytes);
@@ -86,7 +86,7 @@ const halfFloat = half => {
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + rest / 1024) : rest * 2 ** -24);
 };
 
-// Planes [number, whole] of bytes as `each` bytes of a splat.
+// Interleave byte planes [number, whole] into `each` bytes per splat.
 function interleave(planes, whole, count, number, out, each) {
   for (let plane = 0; plane < number; plane++) {
     for (let i = 0, from = plane * whole, to = plane; i < count; i++, from++, to += each) out[to] = planes[from];

@@ -37,10 +37,11 @@ class Painter {
     const attributes = {antialias: false, alpha: false, powerPreference: "high-performance"};
     const gl = this.gl = canvas.getContext("webgl2", attributes);
     if (!gl) throw Error("this browser has no WebGL2; enable hardware acceleration, or use another browser");
-    // Hundreds of layers blended in 8 bits lose 10 dB; half floats lose nothing that an 8-bit image shows.
+    // Blending hundreds of layers in 8 bits loses 10 dB; with half floats, no loss is visible in an 8-bit image.
     this.half = !!(gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float"));
     this.maxSize = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-    if (this.maxSize < ROW) throw Error(`this device has textures of ${this.maxSize} px; ${ROW} are needed`);
+    const limit = this.maxSize;
+    if (limit < ROW) throw Error(`textures need ${ROW} px, but this device allows only ${limit}; use another device`);
     this.programs = {};
     this.programsFor(STATIC_MODEL);
     this.present = program(gl, COVER, PRESENT);
@@ -160,7 +161,7 @@ class Painter {
     gl.uniform4fv(used.at("intrinsics"), frame.intrinsics);
     gl.uniform4fv(used.at("limits"), frame.limits);
     gl.uniform2f(used.at("size"), width, height);
-    // A normalized filter suits every resolution; any other belongs to the resolution of training and is scaled.
+    // A normalized filter works at every resolution; other filters match the training resolution and are scaled.
     const wider = 1 + (1 - header.compensate) * (Math.max(1, frame.enlarged) ** 2 - 1);
     gl.uniform3f(used.at("filters"), header.near, header.variance * wider, header.compensate);
     gl.uniform1i(used.at("mode"), MODES.indexOf(mode));

@@ -21,7 +21,7 @@ class Frustums {
     const context = this.canvas.getContext("2d"), {width, height} = this.viewer.canvas;
     this.canvas.hidden = !this.shown;
     if (!this.shown) return;
-    Object.assign(this.canvas, {width, height}); // and empties it
+    Object.assign(this.canvas, {width, height}); // this also clears the canvas
     for (const [left, top] of corners) {
       context.setTransform(ratio, 0, 0, ratio, left * ratio, top * ratio);
       context.lineWidth = 1.3;

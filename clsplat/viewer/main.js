@@ -102,7 +102,7 @@ class Viewer extends PageCamera {
     document.documentElement.dataset.ready = "1";
   }
 
-  // Rotate about the nearest splat that covers a pixel of the stage, and measure its distance from the previous one.
+  // Rotate about the nearest splat that covers a pixel of the stage, and measure its distance from the previous pivot.
   focus(x, y) {
     const {width, height} = this.pane(), [u, v] = [x % width, y % height], [layer] = this.layers;
     const frame = makeFrame(this.camera, width, height, false), rows = [0, 1, 2].map(i => axis(this.camera, i));
@@ -149,7 +149,7 @@ class Viewer extends PageCamera {
 async function open() {
   const canvas = find("canvas"), info = JSON.parse(find("scene").textContent);
   const painter = new Painter(canvas), layers = [];
-  canvas.addEventListener("webglcontextlost", () => fail("the graphics device was lost; load the page again"));
+  canvas.addEventListener("webglcontextlost", () => fail("the graphics device was lost; reload the page"));
   for (const [i, header] of info.models.entries()) {
     const script = find(`model${i}`), buffer = await inflate(script.textContent.trim());
     script.remove(); // its text is no longer needed

@@ -1,4 +1,4 @@
-// The camera of a page: moved by the controls, flown to a view, stored in the address.
+// The camera of a page: moved by the controls, flown to a view, stored in the URL.
 
 class PageCamera {
   constructor(info, canvas) {
@@ -7,7 +7,7 @@ class PageCamera {
     this.pivot = info.pivot;
   }
 
-  // Read the camera and the timestamp from the address; return whether it has a camera.
+  // Read the camera and the timestamp from the URL; return whether it has a camera.
   readAddress() {
     const camera = location.hash === this.hash ? null : parseCamera(location.hash);
     if (camera) this.move(camera);
@@ -66,11 +66,11 @@ class PageCamera {
     } else this.camera = interpolateCameras(from, to, Math.max(0, t * t * (3 - 2 * t)));
   }
 
-  // The camera is at rest: store it in the address.
+  // The camera is at rest: store it in the URL.
   storeInAddress() {
     const text = `#${formatCamera(this.camera)}${this.clock ? `;${+this.timestamp.toFixed(4)}` : ""}`;
     if (text === location.hash) return;
     this.hash = text;
-    try { history.replaceState(null, "", text); } catch { /* too frequent, or not allowed: keep the address */ }
+    try { history.replaceState(null, "", text); } catch { /* too frequent, or not allowed: keep the URL */ }
   }
 }

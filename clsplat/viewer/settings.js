@@ -44,7 +44,7 @@ class Settings extends Panel {
       `${layers.length > 1 ? `${name}: ` : ""}${formatCount(drawn)} of ${formatCount(count)} splats` +
       (sky ? `, ${formatCount(sky)} of the sky` : "") +
       (faint ? ` + ${formatCount(faint)} too faint to draw` : ""));
-    if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms a frame`);
+    if (ms !== null) parts.push(`${ms < 10 ? ms.toFixed(1) : Math.round(ms)} ms per frame`);
     if (scale < 1) parts.push(`${Math.round(100 * scale)} % resolution`);
     if (this.viewer.distance) parts.push(`distance of the last two points: ${this.viewer.distance.toPrecision(4)}`);
     find("statistics").textContent = parts.join(" · ");

@@ -7,7 +7,7 @@ function opacityFactor({rows, stride}, i, dt) {
   return Math.exp(-late * late / 2);
 }
 
-// Its displacement along an axis at that time.
+// The displacement of splat i along an axis at that time.
 function displacement({rows, stride, bends}, i, axis, dt) {
   const k = i * stride + axis, bend = bends > 0 ? rows[k + 5] + (bends > 1 ? rows[k + 8] * dt : 0) : 0;
   return dt * (rows[k] + dt * bend);

@@ -33,7 +33,7 @@ Level = Literal["cameras", "ground"]
 
 @dataclass(frozen=True)
 class AlignOptions:
-    """The options of an alignment, which state what is known about a scene."""
+    """Options of an alignment: what is known about the scale, up direction, and position of a scene."""
 
     level: Level | None = None  # where the up direction comes from
     distances: tuple[str, ...] = ()  # scale bars, see clsplat/scene/control.py

@@ -27,7 +27,7 @@ def require_divisible(pipeline: Pipeline) -> None:
     modules = [module for stage in optimize_stages for module in stage.modules if "blocks" in module.conflicts]
     faults = {
         "prepare": (settings.prepare, "run it first and give its run folder as --scene"),
-        "adapt": (settings.adapt, "each block would decide by its own photos; write the settings explicitly"),
+        "adapt": (settings.adapt, "each block would adapt them to its own photos; set them explicitly"),
         "model.time": (settings.model.time, "moving Gaussians leave their cells; leave it out"),
         "model.background": (settings.model.background, "each block would learn its own sky; leave it out"),
         "scene.levels": (settings.scene.levels > 1, "a block uses views of one size; set it to 1"),
@@ -126,7 +126,7 @@ def _with_start(stages: list[Any], file: Path) -> list[Any]:
 
 
 def _limit_growth(stage: dict[str, Any], block: Block) -> dict[str, Any]:
-    """Return a stage of a resolved pipeline, in which `_limit_densify` has limited all densification."""
+    """Return a stage of a resolved pipeline with its densification limited by `_limit_densify`."""
     ((name, fields),) = stage.items()
     if name == "densify":
         densify = _limit_densify(Densify.model_validate(fields), block).model_dump(mode="json")

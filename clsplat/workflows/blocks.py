@@ -286,7 +286,7 @@ def _coarse_file(coarse: str) -> Path | None:
 
 HEADINGS = ("block", "Gaussians", "initial Gaussians", "views", "cameras inside", "pairs", "initial MiB")
 TIME_HEADING = "estimated time"
-NOTE = "memory is at the start of training; times range from no growth to growth up to an estimated maximum"
+NOTE = "memory: at the start of training; times: without growth, and with growth up to an estimated maximum"
 
 
 def format_table(manifest: dict[str, Any]) -> str:

@@ -206,7 +206,7 @@ def page(
         subtitle=f"{model}; PSNR and SSIM of the {split} views, measured on every file after reading it back",
         result=result,
         verdict=_verdict(target, source, best_entry),
-        curves=mark_charts_safe([line_chart("PSNR, dB, over the file's size, MB", _lines(target, source, entries))]),
+        curves=mark_charts_safe([line_chart("PSNR (dB) over file size (MB)", _lines(target, source, entries))]),
         headings=HEADINGS,
         rows=[(entry.file, cells(entry, source), entry == best_entry) for entry in (source, *entries)],
     )

@@ -155,7 +155,7 @@ def _has_name(stage: Any, name: str) -> bool:
 
 # A folder in which models are trained for one set of inputs, so that interrupted work can resume.
 
-LABELS = {"sha256": "the model's bytes"}  # names of identity keys in messages
+LABELS = {"sha256": "model bytes"}  # names of identity keys in messages
 
 
 @contextmanager

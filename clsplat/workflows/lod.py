@@ -139,7 +139,7 @@ def build_levels(
         write_sky_file(gaussians.sky, temporary_folder / LOD_META, digest)
     if gaussians.sky:
         name = sky_path(folder / LOD_META).name
-        LOG.info("%s: the sky of the finest level is in %s, which only clsplat renders", folder, name)
+        LOG.info("%s: the sky of the finest level is in %s; only clsplat renders it", folder, name)
     return {
         "folder": str(folder),
         "bytes": model_bytes(folder),

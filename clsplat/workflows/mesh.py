@@ -1,4 +1,4 @@
-"""Write the surface of a model as a mesh, or a closed hull for collisions.
+"""Write the surface of a model as a mesh, or as a closed hull for collision detection.
 
 Median depths of the training views are fused into a truncated signed distance field (clsplat/render/fusion.py), from
 which the surface is extracted, cleaned, and smoothed.
@@ -42,7 +42,7 @@ VOXEL = 1.2  # in pixels at the median depth
 TRUNCATION = 5.0  # voxels
 OPAQUE, EMPTY = 0.9, 0.1  # the smallest alpha of pixels whose depth is used, and the largest alpha of empty pixels
 NOTHING = 1e10  # depth of empty pixels, scene units
-WINDOW, SIGMA, SIMILAR = 9, 2.5, 2.0  # bilateral filter: side and deviation, px; deviation of the depths, voxels
+WINDOW, SIGMA, SIMILAR = 9, 2.5, 2.0  # bilateral filter: window side and sigma, px; sigma of the depths, voxels
 PROBES = 16  # views whose depths determine the voxel
 CELL, MAX_CELLS = 2.0, 1 << 23  # of a hull: side of a cell in voxels, and maximum number of cells
 HULL_BYTES = 32  # per cell, on the device and the host
@@ -54,7 +54,7 @@ class MeshOptions:
 
     voxel: float | None = None  # scene units; None: from the size of pixels
     keep: float = 1.0  # fraction of the faces
-    collision: bool = False  # whether to write the closed hull of the space that views do not see as free
+    collision: bool = False  # whether to write a closed hull of all space that the views do not show to be free
 
     def __post_init__(self) -> None:
         if self.voxel is not None and not 0 < self.voxel < math.inf:
@@ -73,10 +73,10 @@ class RenderedDepth(DepthImage):
 
 
 def denoise(image: DepthImage, voxel: float) -> NDArray[np.float32]:
-    """Return the depths with bilateral smoothing (Tomasi & Manduchi 1998).  voxel: scene units.
+    """Return the depths after a bilateral filter (Tomasi & Manduchi 1998).  voxel: scene units.
 
-    Depths beyond the reach of `find_blocks` are left unchanged, because the filter quantizes differences to 1/4096 of
-    their range.
+    The filter quantizes depth differences to 1/4096 of the depth range.  To keep this range small, depths beyond the
+    reach of `find_blocks` are left unchanged.
     """
     depth, reach = image.depth, np.float32(MAX_PIXEL * voxel * image.view.camera.fx)
     smooth = cv2.bilateralFilter(np.minimum(depth, reach), WINDOW, SIMILAR * voxel, SIGMA)
@@ -93,7 +93,7 @@ class DepthSource:
     def images(self, label: str, voxel: float, empty_depth: float = 0.0) -> Iterator[DepthImage]:
         """Yield the denoised depth images of all views.
 
-        voxel: scene units; empty_depth: of pixels that show nothing.
+        voxel: scene units; empty_depth: depth of pixels that show nothing, in scene units.
         """
         for view in counted(self.views, label, len(self.views)):
             image = self.render(view)
@@ -108,7 +108,7 @@ class DepthSource:
         return RenderedDepth(view, depth, np.clip(layers.image, 0, 1), layers.alpha < EMPTY)
 
     def pixel_size(self) -> float:
-        """Return the median size of a pixel on the surface in a sample of views, scene units; 0 if none shows it."""
+        """Return the median size of a pixel on the surface, in scene units, over some views; 0 if no view shows it."""
         sample = np.unique(np.linspace(0, len(self.views) - 1, min(PROBES, len(self.views))).round().astype(int))
         images = [self.render(self.views[i]) for i in sample]
         depths = [(image.depth[image.depth > 0], image.view.camera.fx) for image in images]
@@ -136,7 +136,7 @@ def write_mesh(
     photo_model = ModelFile(model, scene, device, downscale)
     if is_moving(photo_model.gaussians):
         command = f"`clsplat convert {shell_quote(model)} OUT.ply --time T`"
-        raise DataError(f"{model}: the model moves; first write the model of one time: {command}")
+        raise DataError(f"{model}: the model is dynamic; first export it at one time with {command}")
     views = photo_model.scene.split("train") or photo_model.scene.views
     source = DepthSource(Canvas(photo_model.painter), views)
     pixel = source.pixel_size()
@@ -159,8 +159,8 @@ def write_mesh(
 
 
 def _disagreement(model: Path, voxel: float, default: float | None) -> DataError:
-    """Return the error for an empty mesh.  default: its voxel without --voxel, scene units; None: it was used."""
-    advice = f"omit --voxel, which uses {default:.3g}" if default else "check --scene"
+    """Return the error for an empty mesh.  default: the voxel without --voxel, scene units; None if it was used."""
+    advice = f"omit --voxel to use {default:.3g}" if default else "check --scene"
     return DataError(f"{model}: no two views agree on a surface with a voxel of {voxel:.3g} scene units; {advice}")
 
 
@@ -173,7 +173,7 @@ def _surface(source: DepthSource, blocks: Blocks, voxel: float) -> Mesh:
 
 
 def _hull(source: DepthSource, blocks: Blocks, voxel: float, cell: float | None) -> tuple[Mesh, float]:
-    """Return the closed hull of the space that fewer than two views see as free, and the side of a cell, scene units.
+    """Return the closed hull of the space that fewer than two views show to be free, and its cell side, scene units.
 
     cell: side of the cells; None: CELL voxels, doubled until there are at most MAX_CELLS.
     """
@@ -202,7 +202,7 @@ def _box(blocks: Blocks, ratio: float) -> tuple[NDArray[np.int64], NDArray[np.in
 def _require_memory(blocks: int, point_bytes: int, voxel: float) -> None:
     """Log the memory that blocks need.  Raises MemoryLimitError if it exceeds the free memory."""
     size, free = blocks * SIDE**3 * point_bytes, available_memory()
-    LOG.info("voxel %.4g scene units, %s blocks of %d³, %.0f MB", voxel, f"{blocks:,}", SIDE, size / 1e6)
+    LOG.info("voxel %.4g scene units, %s blocks of %d³ voxels, %.0f MB", voxel, f"{blocks:,}", SIDE, size / 1e6)
     if free is not None and size > free:
         raise MemoryLimitError(
             f"--voxel {voxel:.3g}: needs {size / 2**30:.1f} GiB of memory, but only {free / 2**30:.1f} GiB is free; "

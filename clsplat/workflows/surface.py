@@ -24,7 +24,7 @@ MIN_VALUE = 2e-3  # of a distance, so that no vertex is at a grid point, where i
 MIN_FRACTION = 1e-4  # of an edge, from its ends; smaller distances are rounding errors
 MIN_PART = 0.01  # of the faces of the largest part; smaller parts are removed
 TAUBIN, ROUNDS = (0.5, -0.53), 20  # Taubin 1995: factors of two steps that together do not shrink; number of rounds
-MORE_FACES = 1.5  # factor on the faces after a reduction that opened a closed surface
+MORE_FACES = 1.5  # factor on the number of faces to keep, each time a reduction opens a closed surface
 MIN_REDUCED = 1000  # faces: smaller meshes are not reduced
 
 

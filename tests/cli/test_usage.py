@@ -99,7 +99,7 @@ NEAR = {
     "--devise x run": "clsplat: no option --devise; did you mean --device?",
     "render x --split tset": "invalid value for '--split'",
     "check lodout": "no pipeline named 'lodout', and no such file or folder; `clsplat pipelines` lists pipelines",
-    "run smoke --scene x --set steps=3": "--set steps=3: no key 'steps' at the top of a pipeline; did you mean",
+    "run smoke --scene x --set steps=3": "--set steps=3: no key 'steps' at the top level of a pipeline; did you mean",
     "resume nowhere": "nowhere: has no pipeline.yaml; expected the folder of a started run",
     "status nowhere": "nowhere: has no readable status.json; expected a run folder",
     "pipelines --copy x": "--copy needs the name of a pipeline",

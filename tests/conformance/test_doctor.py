@@ -48,7 +48,7 @@ VERDICTS = {
     "the other one is wrong": (
         {"wide": result(RIGHT), "simt": result(WRONG)},
         True,
-        "use it; a failure does not affect training: with the simt schedule, blend_backward differs by 0.03",
+        "use it; this failure does not affect training: with the simt schedule, blend_backward differs by 0.03",
     ),
     "both are wrong": (
         {"wide": result(WRONG), "simt": result(fault="the runtime crashes with SIGABRT")},
@@ -80,7 +80,7 @@ def test_verdict_has_a_remedy(case):
 
 def test_memory_faults_are_reported_although_kernels_pass():
     verdict = judge("wide", {"wide": result(RIGHT)}, result(Deviation("fill_words", "samples", 3, 0, counts=True)))
-    assert verdict.text == "use it; a failure does not affect training: fill_words gives 3 wrong values in samples"
+    assert verdict.text == "use it; this failure does not affect training: fill_words gives 3 wrong values in samples"
 
 
 def test_checks_continue_after_a_runtime_crashes(monkeypatch, info):
@@ -263,7 +263,8 @@ def test_wrong_values_in_a_large_buffer_are_a_fault(monkeypatch, largest):
     failures, report = memory_of(monkeypatch, largest, Deviation("fill_words", "samples", 3, 0, counts=True))
     assert failures
     assert (
-        report.verdict.text == "use it; a failure does not affect training: fill_words gives 3 wrong values in samples"
+        report.verdict.text
+        == "use it; this failure does not affect training: fill_words gives 3 wrong values in samples"
     )
 
 

@@ -181,8 +181,8 @@ def test_counts_are_not_printed_above_the_bar(now, screen, log_shown):
 def test_mapping_summary_counts_registered_photographs():
     figures = {"registered": 32, "not_registered": ["IMG_0034.jpg"], "points": 9, "error_px": 1.268}
     step = MapCameras(stage="map_cameras")
-    assert step.summary(figures) == "32 of 33 photos placed, reprojection error 1.27 px; left out: IMG_0034.jpg"
-    assert step.summary({**figures, "not_registered": []}) == "32 of 32 photos placed, reprojection error 1.27 px"
+    assert step.summary(figures) == "32 of 33 photos registered, reprojection error 1.27 px; left out: IMG_0034.jpg"
+    assert step.summary({**figures, "not_registered": []}) == "32 of 32 photos registered, reprojection error 1.27 px"
     many = step.summary({**figures, "not_registered": [f"{i}.jpg" for i in range(20)]})
     assert many.endswith("6.jpg, 7.jpg, and 12 more")
 
@@ -192,7 +192,7 @@ def test_unreadable_photographs_are_counted():
     assert FindFeatures(stage="find_features").summary(features) == "features found in 4 photos from 2 cameras"
     cameras = {"registered": 3, "not_registered": ["c.jpg"], "error_px": 0.5}
     text = summarize_placement({"find_features": features, "map_cameras": cameras})
-    assert text == "3 of 5 photos placed, reprojection error 0.50 px; left out: b.jpg (not an image), c.jpg"
+    assert text == "3 of 5 photos registered, reprojection error 0.50 px; left out: b.jpg (not an image), c.jpg"
     assert summarize_placement({"find_features": "damaged", "map_cameras": cameras}) == ""
 
 

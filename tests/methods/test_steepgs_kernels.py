@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import GRADIENT, relative_error
+from clsplat.conformance.check import Tol, relative_error
 from clsplat.conformance.scenes import Case, random_case, safe_case
 from clsplat.density.control import densify
 from clsplat.density.edit import Edit, Rule
@@ -151,7 +151,7 @@ def test_column_matches_the_reference_matrix(device, rng, count):
     actual, stats = added_up(device, case, weights, views=2)
     on_screen = ref.splitting_matrices(case.project(), 33, 31, BACKGROUND.astype(np.float64), weights)
     expected = ref.scene_splitting_matrices(case.gaussians(), case.camera(), on_screen)
-    assert relative_error(actual, 2 * expected[:, *np.triu_indices(3)]) < GRADIENT
+    assert relative_error(actual, 2 * expected[:, *np.triu_indices(3)]) < Tol.GRADIENT
     assert (actual[2::7] == 0).all()
     np.testing.assert_allclose(stats.means("splitting"), np.where(stats.means("screen_grad") > 0, actual / 2, 0))
     stats.clear()

@@ -15,7 +15,7 @@ from clsplat.prepare import diagnosis as reasons_tool
 from clsplat.prepare import mapping
 from clsplat.prepare.cache import fingerprint
 from clsplat.prepare.database import open_database, read_image_names
-from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unplaced
+from clsplat.prepare.diagnosis import MatchGraph, diagnose, explain_unregistered
 from clsplat.prepare.features import FeatureOptions, detect_sift, find_features
 from clsplat.prepare.gather import gather, list_photographs, warnings_for
 from clsplat.prepare.mapping import map_cameras
@@ -149,7 +149,7 @@ def test_features_are_at_the_spots(min_side):
     assert len(detect_sift(np.rint(pixels).astype(np.uint8), FeatureOptions(count=2))[0]) == 2
 
 
-# ---- photographs that cannot be placed
+# ---- photographs that cannot be registered
 
 
 def test_unreadable_files_come_with_a_conversion_command(tmp_path, caplog):
@@ -212,7 +212,7 @@ def matched(tmp_path: Path) -> MatchGraph:
 
 
 def test_each_unregistered_photograph_has_a_reason(tmp_path):
-    result = explain_unplaced(matched(tmp_path), [{"a", "b", "c"}])
+    result = explain_unregistered(matched(tmp_path), [{"a", "b", "c"}])
     assert result == {
         "blurred": "blurred",
         "soft": "few matches, at most 20, with a; it may be blurred",
@@ -225,17 +225,18 @@ def test_each_unregistered_photograph_has_a_reason(tmp_path):
         "many": "80 matches with a, but too few on points of the model",
     }
     assert (
-        explain_unplaced(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"]
+        explain_unregistered(matched(tmp_path), [{"a", "b", "c"}, {"pair", "other"}])["pair"]
         == "in a separate reconstruction, with other"
     )
     figures = {"registered": 3, "not_registered": ["plain"], "reasons": result, "other_models": [2]}
     missing, others = warnings_for(figures)
-    assert "1 of 4 photos could not be placed and are not used: plain (only 40 features: blurred" in missing
+    assert "1 of 4 photos could not be registered and are not used: plain (only 40 features: blurred" in missing
     assert missing.endswith("viewpoints in between, or find more features (find_features.long_side)")
-    assert others == "only the largest model is used, without 1 smaller model of 2 photos: add photos that connect them"
+    remedy = "add photos that connect the models"
+    assert others == f"only the largest model is used, without 1 smaller model of 2 photos; {remedy}"
     missing, others = warnings_for({**figures, "other_models": [3, 1], "denser_tried": True})
     assert missing.endswith("viewpoints in between")
-    assert others.startswith("only the largest model is used, without 2 smaller models of 3, 1 photo: add")
+    assert others.startswith("only the largest model is used, without 2 smaller models of 3, 1 photo; add")
 
 
 def test_failed_mapping_is_described_by_groups(tmp_path):
@@ -245,7 +246,7 @@ def test_failed_mapping_is_described_by_groups(tmp_path):
         "without a good match (alone, elsewhere, few, plain, soft); take photos of one scene, with more overlap"
     )
     joined = replace(result, pairs={**result.pairs, ("a", "pair"): 30})
-    assert diagnose(joined).startswith("take more sharp photos"), "seven of twelve belong together"
+    assert diagnose(joined).startswith("take more photos, sharp"), "seven of twelve belong together"
     weak = replace(result, pairs={("a", "b"): 20, ("b", "c"): 29})
     assert diagnose(weak).startswith("no two of them overlap enough: at most 29 features match; take")
     two = MatchGraph(tmp_path, dict.fromkeys("abc", 3000), {("a", "b"): 200})
@@ -265,7 +266,7 @@ def test_blur_differs_from_a_soft_but_sharp_photograph(tmp_path):
     find_features(tmp_path / "photographs", tmp_path / "features", FeatureOptions(700, 3000))
     match_features(tmp_path / "features", tmp_path / "matches")
     result = MatchGraph.from_database(pycolmap, tmp_path / "matches" / "database.db", tmp_path / "photographs")
-    assert explain_unplaced(result, [{"0.png", "1.png", "2.png"}]) == {
+    assert explain_unregistered(result, [{"0.png", "1.png", "2.png"}]) == {
         "blurred.png": "blurred",
         "elsewhere.png": "matches no other photo; it may be blurred",
     }
@@ -387,7 +388,7 @@ def test_rotation_only_model_is_refused_among_unrelated_photos(tmp_path, dense):
     matches, cameras = prepared(
         tmp_path, [rotated_view(number) if number < 6 else unrelated_photograph(number) for number in range(14)]
     )
-    with pytest.raises(DataError, match=r"the \d of 14 photos that were placed look as if"):
+    with pytest.raises(DataError, match=r"the \d of 14 photos that were registered look as if"):
         map_cameras(matches, cameras)
     assert not (cameras / "sparse").exists()
 

@@ -73,7 +73,7 @@ def test_left_out_photographs_are_reported_again(photos, tmp_path, monkeypatch, 
     caplog.clear()
     prepare(plan(steps, photos, tmp_path / "prepared"), photos, tmp_path / "prepared")
     assert "1 of 5 photos cannot be read: b.jpg (not an image)" in caplog.text
-    assert "1 of 4 photos could not be placed and are not used: c.jpg" in caplog.text
+    assert "1 of 4 photos could not be registered and are not used: c.jpg" in caplog.text
 
 
 def test_steps_after_a_change_are_redone(photos, tmp_path):
@@ -328,7 +328,8 @@ def test_changed_setting_is_another_run(pipeline, photos, tmp_path):
     assert "find_features  done" in run(pipeline, photos, "--dry-run", "--set", "optimize.log_every=2")
     run(pipeline, photos, "--set", "optimize.log_every=2")
     assert (tmp_path / "runs" / "smoke-2" / "metrics.json").is_file()
-    assert "long_side is 50, was 99" in run(pipeline, photos, "--dry-run", "--set", "find_features.long_side=50")
+    text = run(pipeline, photos, "--dry-run", "--set", "find_features.long_side=50")
+    assert "long_side changed from 99 to 50" in text
     (photos / "p.txt").write_text("other")
     assert "its input has changed" in run(pipeline, photos, "--dry-run")
 

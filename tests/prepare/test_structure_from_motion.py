@@ -154,7 +154,7 @@ def test_further_attempts_use_the_matching_mode_or_are_off(photos, tmp_path, mon
     find_features(photos, tmp_path / "features", FeatureOptions(240, 16))
     match_features(tmp_path / "features", tmp_path / "matches", "sequential", 2)
     caplog.set_level("INFO")
-    with pytest.raises(DataError, match="could not be placed"):
+    with pytest.raises(DataError, match="could not be registered"):
         map_cameras(tmp_path / "matches", tmp_path / "once", attempts=1)
     assert "trying again" not in caplog.text
     used, more = list[Pairing](), list[int]()

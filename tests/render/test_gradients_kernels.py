@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import GRADIENT, relative_error
+from clsplat.conformance.check import Tol, relative_error
 from clsplat.conformance.scenes import SHARP_THRESHOLDS, Case, add_world_filter, random_case, safe_case
 from clsplat.opencl.device import Device
 from clsplat.render.rasterizer import PIXEL_SUMS, Frame, Rasterizer
@@ -70,7 +70,7 @@ def test_tile_lists_that_end_at_a_batch_boundary(device, rng, count):
     weights = rng.normal(size=(3, 14, 14)).astype(np.float32)
     values, frame, _ = gradients_of(device, case, weights)
     assert frame.lists.pairs >= count
-    compare(values, expected_gradients(case, weights), GRADIENT)
+    compare(values, expected_gradients(case, weights), Tol.GRADIENT)
 
 
 @on_devices("count, width, height", [(1, 16, 16), (16, 20, 18), (17, 33, 15), (40, 40, 30), (65, 24, 24)])
@@ -78,7 +78,7 @@ def test_gradients(device, rng, count, width, height):
     case = safe_case(rng, count, width, height)
     weights = rng.normal(size=(3, height, width)).astype(np.float32)
     values, *_ = gradients_of(device, case, weights)
-    compare(values, expected_gradients(case, weights), GRADIENT)
+    compare(values, expected_gradients(case, weights), Tol.GRADIENT)
 
 
 @on_devices("variance, compensate", [(0.3, 1.0), (0.1, 1.0)])
@@ -89,7 +89,7 @@ def test_gradients_with_filters(device, rng, variance, compensate):
     smooth = Device(device.info, device.schedule)
     smooth.tuning.update(device.tuning, ALPHA_MIN="1e-30f", TRANSMITTANCE_MIN="1e-30f")
     values, *_ = gradients_of(smooth, case, weights)
-    compare(values, expected_gradients(case, weights, ref.SMOOTH_THRESHOLDS), GRADIENT)
+    compare(values, expected_gradients(case, weights, ref.SMOOTH_THRESHOLDS), Tol.GRADIENT)
 
 
 def test_finished_pixels_pass_no_gradient_behind(device, rng):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, relative_error
+from clsplat.conformance.check import Tol, relative_error
 from clsplat.conformance.checks.motion import TIME, check_motion_at_time, motion, moving_case
 from clsplat.conformance.scenes import random_case
 from clsplat.density.statistics import SplatStats
@@ -65,8 +65,8 @@ def test_image_gradients_reach_the_motion(device, rng):
     )
     found = gradients_of(model)
     for column in range(width):
-        assert relative_error(found[MOTION][:, column], grad_motion[:, column]) < CONIC
-    assert relative_error(found["logit_opacity"][:, 0], grad_logit) < CONIC
+        assert relative_error(found[MOTION][:, column], grad_motion[:, column]) < Tol.CONIC
+    assert relative_error(found["logit_opacity"][:, 0], grad_logit) < Tol.CONIC
     for name in ("means", "quats", "log_scales", "sh_base", "sh_rest"):
         np.testing.assert_array_equal(found[name], static[name])
 

@@ -132,7 +132,7 @@ def test_split_that_depends_on_cameras_is_not_refused_early(photos, caplog):
     text = describe(pipeline, RunState.read(out), None, "new")
     assert "if all 23 photos get a camera, the run is refused:" in text
     assert "'00.png' is a test view" in text
-    assert "the photos decide init.transparent, " in text, "what they will decide"
+    assert "chosen from the photos: init.transparent, " in text, "what they will decide"
 
 
 def test_skipped_files_are_reported_once(photos, caplog):
@@ -148,7 +148,7 @@ def test_dry_run_lists_the_undecided_settings(photos):
         for line in describe(pipeline, RunState.read(photos.parent / "runs" / "a"), None, "new").splitlines()
     ]
     (actual,) = [line for line in lines if line.startswith("adapt ")]
-    assert "the photos decide init.transparent, init.count, " in actual
+    assert "chosen from the photos: init.transparent, init.count, " in actual
     assert "dropout" not in actual
 
 

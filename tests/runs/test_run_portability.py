@@ -105,7 +105,8 @@ def test_summary_offers_no_more_steps_to_an_overfit_model(done, tmp_path):
 
 
 def test_summary_names_missing_photographs(done, tmp_path):
-    assert summarize_placement(FOUND) == "32 of 33 photos placed, reprojection error 1.27 px; left out: IMG_0034.jpg"
+    text = summarize_placement(FOUND)
+    assert text == "32 of 33 photos registered, reprojection error 1.27 px; left out: IMG_0034.jpg"
     assert summarize_placement({}) == summarize_placement({"map_cameras": {"registered": "x"}}) == ""
     many = {"map_cameras": {**FOUND["map_cameras"], "not_registered": [f"{i}.jpg" for i in range(10)]}}
     assert summarize_placement(many).endswith("7.jpg, and 2 more")
@@ -114,7 +115,7 @@ def test_summary_names_missing_photographs(done, tmp_path):
         json.dumps({**metrics, "preparation": FOUND | {"undistort": {"seconds": 7.2}}})
     )
     text = "\n".join(summarize_run(tmp_path))
-    assert "; 32 of 33 photos placed" in text
+    assert "; 32 of 33 photos registered" in text
     assert "undistort 7 s" in text
 
 

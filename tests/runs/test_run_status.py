@@ -65,7 +65,8 @@ def test_status_prints_left_out_photographs(tmp_path):
     status = write_and_read_status(tmp_path, state="done", progress=None)
     features, cameras = {"damaged": {"b.jpg": "cut"}}, {"registered": 3, "not_registered": [], "error_px": 0.5}
     status["metrics"] = {"preparation": {"find_features": features, "map_cameras": cameras}}
-    assert "3 of 4 photos placed, reprojection error 0.50 px; left out: b.jpg (cut)" in reading.format_status(status)
+    text = reading.format_status(status)
+    assert "3 of 4 photos registered, reprojection error 0.50 px; left out: b.jpg (cut)" in text
 
 
 def test_clock_ahead_is_noted_and_gives_no_negative_time(tmp_path):

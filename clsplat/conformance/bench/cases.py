@@ -154,7 +154,7 @@ class BenchResult:
     memory: int  # bytes on the device, at peak
     planned: int  # bytes, from the memory plan of training
     launches: int  # kernels in a step
-    bytes: int  # that the kernels of a step read and write, see `traffic`
+    bytes: int  # bytes that the kernels of a step read and write, see `traffic`
 
 
 class BenchCase:

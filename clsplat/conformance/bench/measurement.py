@@ -19,7 +19,7 @@ from clsplat.pipeline.loading import load
 EXPECTED_FILE = "the JSON of an earlier `clsplat bench --json`"
 UNITS: dict[str, str] = {"gflops": "GFLOP/s", "gexp": "Gexp/s", "gbytes": "GB/s"}
 TOTALS = {"host": "host", "step": "step", "steps without waits": "steps", "densify": "densify"}  # row labels and keys
-MAX_PEAK_RATIO = 1.1  # largest ratio of two peaks for times to be comparable
+MAX_PEAK_RATIO = 1.1  # times are comparable only if the ratio of the peaks is at most this
 
 
 class _Peaks(BaseModel):
@@ -71,7 +71,7 @@ def compare_conditions(new: dict[str, Any], earlier: dict[str, Any]) -> list[str
     """Return lines of text about differences between the `data` of two measurements, other than times."""
     lines = [f"earlier: {peaks_text(earlier['peaks'])}"]
     if earlier["device"] != new["device"]:
-        lines.append(f"  on another device: {quote(earlier['device'])}")
+        lines.append(f"  measured on another device: {quote(earlier['device'])}")
     ratios = {unit: new["peaks"][key] / earlier["peaks"][key] for key, unit in UNITS.items() if earlier["peaks"][key]}
     if any(not 1 / MAX_PEAK_RATIO <= ratio <= MAX_PEAK_RATIO for ratio in ratios.values()):
         changes = ", ".join(f"{ratio:.2f} of its {unit}" for unit, ratio in ratios.items())

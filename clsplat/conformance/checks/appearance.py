@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import SUM, Checks, Results, compare_max, match
+from clsplat.conformance.check import Checks, Results, Tol, compare_max, match
 from clsplat.conformance.checks.images import SIZES, blank_image, make_camera, to_planes
 from clsplat.conformance.reference import appearance
 from clsplat.conformance.reference.appearance import unclamped_grid_colors
@@ -85,7 +85,7 @@ def check_grid(
     floor = max(float(np.sqrt(gradient.size)) / 8, 1.0)
     for kernel in ("color_grid_row_sums", "color_grid_gather"):
         actual = photograph_grid(grids, grad_grid)
-        yield compare_max(kernel, f"gradient of the grid, {label}", actual, expected_grid, SUM, floor=floor)
+        yield compare_max(kernel, f"gradient of the grid, {label}", actual, expected_grid, Tol.SUM, floor=floor)
     if channels > 3:
         yield match("color_grid_forward", f"fourth plane, {label}", colors[3], planes.get()[3])
         yield match("color_grid_backward", f"gradient of the fourth plane, {label}", grad_image[3], grads.get()[3])
@@ -104,7 +104,7 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
         smoothness, slope = ref.grid_smoothness(photograph_grid(grids, expected[1]))
         actual, truth = np.array([terms.get().sum(dtype=np.float64)]), np.array([weight * smoothness])
         kernel = "color_grid_smoothness"
-        yield compare_max(kernel, f"value, {label}", actual, truth, SUM, floor=1e-2)
+        yield compare_max(kernel, f"value, {label}", actual, truth, Tol.SUM, floor=1e-2)
         actual, truth = photograph_grid(grids, grad_smoothness), weight * slope
         max_gradient = max(float(np.abs(truth).max()), 1e-6)
         yield compare_max(kernel, f"derivatives, {label}", actual, truth, 2e-5, floor=max_gradient)
@@ -117,7 +117,7 @@ def check_table(device: Device, rng: np.random.Generator, nodes: tuple[int, ...]
     tables = {name: table.reshape(3, -1) for name, table in grids.tables().items()}
     for kernel in ("color_grid_update", "color_grid_center"):
         yield compare_max(kernel, f"grids, {label}", tables["values"], expected, 2e-6, floor=1.0)
-    for name, moment, bound in (("moment1", moment1, SUM), ("moment2", moment2, 3 * SUM)):
+    for name, moment, bound in (("moment1", moment1, Tol.SUM), ("moment2", moment2, 3 * Tol.SUM)):
         floor = 0.1 * float(np.abs(moment).max())
         yield compare_max("color_grid_update", f"{name}, {label}", tables[name][1], moment, bound, floor=floor)
         yield match("color_grid_update", f"{name} of other photos, {label}", tables[name][[0, 2]], 0.0)
@@ -161,7 +161,7 @@ def check_color(device: Device, rng: np.random.Generator, width: int, height: in
     yield match("colors_backward", f"gradient outside the image, {label}", blank_image(camera, grad), 0.0)
     floor, actual_matrix = float(np.sqrt(gradient.size)), wait_for_matrix()
     yield compare_max(
-        "colors_backward", f"gradient of the matrix, {label}", actual_matrix, grad_matrix, SUM, floor=floor
+        "colors_backward", f"gradient of the matrix, {label}", actual_matrix, grad_matrix, Tol.SUM, floor=floor
     )
     if channels > 3:
         yield match("colors_forward", f"fourth plane, {label}", actual[3], planes.get()[3])
@@ -200,7 +200,7 @@ def check_response(device: Device, rng: np.random.Generator, width: int, height:
     yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, grad_image[:3]), 0.0)
     floor = float(np.sqrt(gradient.size))
     actual = row_gradient(row, sums)
-    yield compare_max(kernel, f"gradient of the parameters, {label}", actual, grad_row, SUM, floor=floor)
+    yield compare_max(kernel, f"gradient of the parameters, {label}", actual, grad_row, Tol.SUM, floor=floor)
     if channels > 3:
         yield match(kernel, f"fourth plane, {label}", colors[3], planes.get()[3])
         yield match(kernel, f"gradient of the fourth plane, {label}", grad_image[3], grads.get()[3])

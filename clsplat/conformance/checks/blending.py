@@ -8,19 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import (
-    CONIC,
-    DEPTH,
-    GRADIENT,
-    SUM,
-    Checks,
-    Results,
-    check_image,
-    compare,
-    compare_max,
-    count_true,
-    match,
-)
+from clsplat.conformance.check import Checks, Results, Tol, check_image, compare, compare_max, count_true, match
 from clsplat.conformance.checks.images import SIZES, blank_image, make_camera, make_comparison, to_planes
 from clsplat.conformance.scenes import Case, random_case, safe_case, sums_to_gradients
 from clsplat.density.statistics import ABS_X
@@ -92,13 +80,13 @@ def check_sum(case: Case, sums: NDArray[Any], weights: NDArray[Any], label: str)
     kernel, splats = "blend_backward", case.project()
     truth = ref.blend_backward(splats, *case.size, BACKGROUND.astype(np.float64), weights)
     mean2d, conic = sums_to_gradients(splats, sums)
-    yield compare(kernel, f"gradients of splat means, {label}", mean2d, truth.mean2d, GRADIENT)
-    yield compare(kernel, f"gradients of conics, {label}", conic, truth.conic, GRADIENT)
-    yield compare(kernel, f"gradients of opacities, {label}", sums[:, 0], truth.opacity * splats.opacity, GRADIENT)
-    yield compare(kernel, f"gradients of colors, {label}", sums[:, 6:9], truth.color, GRADIENT)
+    yield compare(kernel, f"gradients of splat means, {label}", mean2d, truth.mean2d, Tol.GRADIENT)
+    yield compare(kernel, f"gradients of conics, {label}", conic, truth.conic, Tol.GRADIENT)
+    yield compare(kernel, f"gradients of opacities, {label}", sums[:, 0], truth.opacity * splats.opacity, Tol.GRADIENT)
+    yield compare(kernel, f"gradients of colors, {label}", sums[:, 6:9], truth.color, Tol.GRADIENT)
     if sums.shape[1] > PIXEL_SUMS:
         actual = sums[:, ABS_X : ABS_X + 2]
-        yield compare(kernel, f"absolute gradients, {label}", actual, truth.mean2d_abs, GRADIENT)
+        yield compare(kernel, f"absolute gradients, {label}", actual, truth.mean2d_abs, Tol.GRADIENT)
 
 
 def _make_opaque(parameters: dict[str, NDArray[Any]]) -> None:
@@ -142,7 +130,7 @@ def gradients_of_blending(device: Device, rng: np.random.Generator) -> Results:
 
 
 def make_faint(parameters: dict[str, NDArray[Any]]) -> None:
-    """Make splats so faint and large that each pixel blends some 900 of them."""
+    """Make splats so faint and large that each pixel blends about 900 of them."""
     parameters["log_scales"] += 4
     parameters["logit_opacity"][:] = -4.6
 
@@ -167,11 +155,11 @@ def statistics_of_blending(device: Device, rng: np.random.Generator) -> Results:
     sums = sum_pixels(device, case, weights, ALL_SUMS, texture=texture)
     yield from check_sum(case, sums, weights, "with weights and texture")
     blend_weights = ref.blend_weights(case.project(), width, height) * (texture >= 0)
-    yield compare("blend_backward", "sums of weights", sums[:, WEIGHT], blend_weights.sum(axis=(1, 2)), GRADIENT)
+    yield compare("blend_backward", "sums of weights", sums[:, WEIGHT], blend_weights.sum(axis=(1, 2)), Tol.GRADIENT)
     expected = (blend_weights * texture).sum(axis=(1, 2))
-    yield compare("blend_backward", "sums of texture", sums[:, WEIGHT + 1], expected, GRADIENT)
+    yield compare("blend_backward", "sums of texture", sums[:, WEIGHT + 1], expected, Tol.GRADIENT)
     squares = ref.falloff_squares(case.project(), width, height, BACKGROUND.astype(np.float64), weights)
-    yield compare("blend_backward", "sums of squares", sums[:, SQUARE], squares, GRADIENT)
+    yield compare("blend_backward", "sums of squares", sums[:, SQUARE], squares, Tol.GRADIENT)
     flags = np.where(texture < 0, -1, texture > 0.3).astype(np.float32)
     for scene in (case, safe_case(rng, 300, width, height, 2e-6, _make_opaque)):  # finished pixels
         counts = sum_pixels(device, scene, weights, ALL_SUMS, texture=flags)[:, BLENDED]
@@ -197,13 +185,17 @@ def loss_of_what_is_left(device: Device, rng: np.random.Generator) -> Results:
         alpha_gradients = ref.blend_backward(black, width, height, np.array([1.0, 0, 0]), channel)
         mean2d, conic = sums_to_gradients(splats, sums.get()[:, :count].T.astype(np.float64))
         yield compare(
-            "blend_backward", f"splat means, {label}", mean2d, image_gradients.mean2d + alpha_gradients.mean2d, GRADIENT
+            "blend_backward",
+            f"splat means, {label}",
+            mean2d,
+            image_gradients.mean2d + alpha_gradients.mean2d,
+            Tol.GRADIENT,
         )
         yield compare(
-            "blend_backward", f"conics, {label}", conic, image_gradients.conic + alpha_gradients.conic, GRADIENT
+            "blend_backward", f"conics, {label}", conic, image_gradients.conic + alpha_gradients.conic, Tol.GRADIENT
         )
         opacity = (image_gradients.opacity + alpha_gradients.opacity) * splats.opacity
-        yield compare("blend_backward", f"opacities, {label}", sums.get()[0, :count], opacity, GRADIENT)
+        yield compare("blend_backward", f"opacities, {label}", sums.get()[0, :count], opacity, Tol.GRADIENT)
 
 
 @CHECKS.add("sum_records")
@@ -228,7 +220,7 @@ def sums_of_records(device: Device, rng: np.random.Generator) -> Results:
                 count=count,
             )
             truth = expected[:PIXEL_SUMS] + accumulate * sums[:, :count].astype(np.float64)
-            yield compare("sum_records", f"sums of {count} Gaussians", pixel_sums.get()[:, :count], truth, SUM)
+            yield compare("sum_records", f"sums of {count} Gaussians", pixel_sums.get()[:, :count], truth, Tol.SUM)
 
 
 @CHECKS.add("blend_forward", "blend_backward")
@@ -280,19 +272,21 @@ def check_depth(device: Device, case: Case, weights: Floats, label: str) -> Resu
     mean2d, conic = (getattr(image_gradients, name) + getattr(depth_gradients, name) for name in ("mean2d", "conic"))
     opacity = image_gradients.opacity + depth_gradients.opacity
     actual = sums_to_gradients(splats, pixel_sums)
-    yield compare("blend_backward", f"splat means with depths, {label}", actual[0], mean2d, GRADIENT)
-    yield compare("blend_backward", f"conics with depths, {label}", actual[1], conic, GRADIENT)
+    yield compare("blend_backward", f"splat means with depths, {label}", actual[0], mean2d, Tol.GRADIENT)
+    yield compare("blend_backward", f"conics with depths, {label}", actual[1], conic, Tol.GRADIENT)
     yield compare(
-        "blend_backward", f"opacities with depths, {label}", pixel_sums[:, 0], opacity * splats.opacity, GRADIENT
+        "blend_backward", f"opacities with depths, {label}", pixel_sums[:, 0], opacity * splats.opacity, Tol.GRADIENT
     )
-    yield compare("blend_backward", f"colors with depths, {label}", pixel_sums[:, 6:9], image_gradients.color, GRADIENT)
+    yield compare(
+        "blend_backward", f"colors with depths, {label}", pixel_sums[:, 6:9], image_gradients.color, Tol.GRADIENT
+    )
     sums = -grad_depth * np.where(splats.visible, splats.depth, 0) ** 2
-    yield compare("sum_inverse_depths", f"sums of inverse depths, {label}", depth_sums, sums, GRADIENT)
+    yield compare("sum_inverse_depths", f"sums of inverse depths, {label}", depth_sums, sums, Tol.GRADIENT)
     upstream = mean2d, conic, opacity, image_gradients.color
     settings = case.degree, case.variance, case.compensate
     truth = ref.project_backward(case.gaussians(), case.camera(), *settings, splats, *upstream)["means"]
     truth = truth + grad_depth[:, None] * case.camera().rotation[2]
-    yield compare("inverse_depth_backward", f"gradients of means, {label}", grad_means, truth, CONIC)
+    yield compare("inverse_depth_backward", f"gradients of means, {label}", grad_means, truth, Tol.CONIC)
 
 
 @CHECKS.add("project_forward", "blend_forward", "blend_backward", "sum_inverse_depths", "inverse_depth_backward")
@@ -321,7 +315,7 @@ def median_depths(device: Device, rng: np.random.Generator) -> Results:
         is_safe = gap > MARGIN
         yield count_true("blend_forward", f"median depths near a step, {label}", ~is_safe, limit=0.02 * is_safe.size)
         actual = image[2, :height, :width]
-        yield compare_max("blend_forward", f"median depths, {label}", actual[is_safe], expected[is_safe], DEPTH)
+        yield compare_max("blend_forward", f"median depths, {label}", actual[is_safe], expected[is_safe], Tol.DEPTH)
 
 
 @CHECKS.add("inverse_depth_loss")
@@ -341,12 +335,12 @@ def losses_of_depths(device: Device, rng: np.random.Generator) -> Results:
         expected, grad_plane = ref.inverse_depth_loss(x[3].astype(np.float64), positions, targets, weights)
         label = f"{count} pixels of {width} x {height}"
         terms = comparison.workspace.array("inverse_depth_terms", count).get()
-        yield compare_max("inverse_depth_loss", f"terms, {label}", terms, expected, SUM, floor=1e-3)
+        yield compare_max("inverse_depth_loss", f"terms, {label}", terms, expected, Tol.SUM, floor=1e-3)
         total = np.array([scale * expected.sum()])
-        yield compare_max("inverse_depth_loss", f"value, {label}", np.array([value]), total, SUM, floor=1e-6)
+        yield compare_max("inverse_depth_loss", f"value, {label}", np.array([value]), total, Tol.SUM, floor=1e-6)
         actual, truth = comparison.gradient.get(), np.zeros(comparison.gradient.shape)
         truth[3, :height, :width] = scale * grad_plane
-        yield compare_max("inverse_depth_loss", f"gradient, {label}", actual, truth, SUM, floor=1e-9)
+        yield compare_max("inverse_depth_loss", f"gradient, {label}", actual, truth, Tol.SUM, floor=1e-9)
 
 
 # layer.cl: a layer of splats in front of an image.
@@ -371,7 +365,7 @@ def check_layer(device: Device, rng: np.random.Generator, width: int, height: in
     yield compare_max("lay_over", f"sum, {label}", composite[inside], ref.overlay(layer, exact, image), 1e-6, floor=1.0)
     loss, grad_t = ref.layer_cover(exact, scale)
     yield compare_max("lay_over", f"T dL/dT, {label}", behind[inside], (exact * grad_t)[None], 1e-6, floor=scale)
-    yield compare_max("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), SUM, floor=0.1)
+    yield compare_max("lay_over", f"loss, {label}", np.array([actual.loss()]), np.array([loss]), Tol.SUM, floor=0.1)
     for output in (composite, behind):
         yield match("lay_over", f"pixels outside the image, {label}", blank_image(camera, output), 0.0)
     actual_gradient = to_planes(device, camera, gradient)

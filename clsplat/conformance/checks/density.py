@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import GRADIENT, SUM, Checks, Deviation, Results, compare, compare_max, match
+from clsplat.conformance.check import Checks, Deviation, Results, Tol, compare, compare_max, match
 from clsplat.conformance.checks.blending import BACKGROUND, MARGIN
 from clsplat.conformance.checks.images import make_comparison, sobel_magnitude, to_planes
 from clsplat.conformance.scenes import Case, add_world_filter, random_case, safe_case
@@ -76,7 +76,7 @@ def statistics(device: Device, rng: np.random.Generator) -> Results:
             actual = gaussians.get(f"stats/{name}")[:, 0]
             is_counted = is_visible | (name == "view_error")  # which also counts for invisible Gaussians
             expected = 2 * values * is_counted
-            yield compare_max(kernel, f"{name} of {count} Gaussians", actual, expected, SUM, floor=0.1)
+            yield compare_max(kernel, f"{name} of {count} Gaussians", actual, expected, Tol.SUM, floor=0.1)
 
 
 @CHECKS.add("accumulate_splitting")
@@ -97,7 +97,7 @@ def splitting_matrices(device: Device, rng: np.random.Generator) -> Results:
             2 * ref.scene_splitting_matrices(case.gaussians(), case.camera(), screen_matrices)[:, *np.triu_indices(3)]
         )
         actual = model.gaussians.get("stats/splitting")
-        yield compare("accumulate_splitting", f"matrices of {count} Gaussians", actual, expected, GRADIENT)
+        yield compare("accumulate_splitting", f"matrices of {count} Gaussians", actual, expected, Tol.GRADIENT)
 
 
 def _run_edit(device: Device, rng: np.random.Generator, count: int) -> tuple[dict[str, NDArray[Any]], Gaussians]:
@@ -147,14 +147,14 @@ def edits(device: Device, rng: np.random.Generator) -> Results:
         logits = initial["logit_opacity"].astype(np.float64)[source]
         is_cloned = actions[source] == ref.CLONE
         logits[is_cloned] = ref.shared_logit(logits[is_cloned], 2)
-        yield compare_max("share_opacity", f"opacities after {label}", result["logit_opacity"], logits, SUM, floor=1)
+        yield compare_max("share_opacity", f"logits after {label}", result["logit_opacity"], logits, Tol.SUM, floor=1)
         for i in np.flatnonzero(is_split):
             noise = ref.normal3((int(i), STEP, 0, 0), (SEED, 0))
             rotation = ref.rotation_matrix(initial["quats"][source[i]].astype(np.float64))
             means[i] += rotation @ (np.exp(scales[i]) * noise)
         scales[is_split] -= np.log(1.6)
-        yield compare("spawn_children", f"means after {label}", result["means"], means, SUM)
-        yield compare_max("spawn_children", f"scales after {label}", result["log_scales"], scales, SUM, floor=1)
+        yield compare("spawn_children", f"means after {label}", result["means"], means, Tol.SUM)
+        yield compare_max("spawn_children", f"scales after {label}", result["log_scales"], scales, Tol.SUM, floor=1)
 
 
 @CHECKS.add("mark_chosen")
@@ -203,7 +203,7 @@ def noise(device: Device, rng: np.random.Generator) -> Results:
             axes = ref.rotation_matrix(p["quats"][i]) * np.exp(p["log_scales"][i])
             offsets[i] = gate[i] * axes @ axes.T @ ref.normal3((i, STEP, 1, 0), (SEED, 0))
         actual = gaussians.get("means").astype(np.float64)
-        yield compare("add_noise", f"means of {count} Gaussians", actual, p["means"] + offsets, SUM)
+        yield compare("add_noise", f"means of {count} Gaussians", actual, p["means"] + offsets, Tol.SUM)
 
 
 # Compression of a model: the contribution of each Gaussian, and clusters for a palette.
@@ -228,11 +228,11 @@ def contribution(device: Device, rng: np.random.Generator) -> Results:
         black, background = np.zeros(3, np.float32), rng.random(3).astype(np.float32)
         actual, repetition = (contributions(_render_views(device, case, photographs, black), count) for _ in range(2))
         label = f"blend weights of {count} Gaussians"
-        yield compare_max("blend_backward", label, actual, np.asarray(expected), SUM, floor=0.1)
+        yield compare_max("blend_backward", label, actual, np.asarray(expected), Tol.SUM, floor=0.1)
         yield match("blend_backward", f"{label}, a second time", repetition, actual)
         actual = sensitivities(_render_views(device, case, photographs, background), count)
         squares = np.sum([_falloff_squares(case, background, mask) for mask in masks], axis=0)
-        yield compare("blend_backward", f"squared changes of the image by {count} Gaussians", actual, squares, GRADIENT)
+        yield compare("blend_backward", f"squared image changes, {count} Gaussians", actual, squares, Tol.GRADIENT)
 
 
 def _render_views(
@@ -272,6 +272,6 @@ def shared_means(device: Device, rng: np.random.Generator) -> Results:
         set_clusters(gaussians, labels, weights)
         average_clusters(gaussians, "sh_rest")
         label, actual = f"means of {clusters} clusters of {count} Gaussians", gaussians.get("sh_rest")
-        yield compare_max("share_mean", label, actual, ref.shared_means(values, labels, weights), SUM, floor=0.1)
+        yield compare_max("share_mean", label, actual, ref.shared_means(values, labels, weights), Tol.SUM, floor=0.1)
         average_clusters(gaussians, "sh_rest")
         yield match("share_mean", f"{label}, a second time", gaussians.get("sh_rest"), actual)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import LOSS_GRADIENT, SUM, Checks, Deviation, Results, compare_max, count_true, match
+from clsplat.conformance.check import Checks, Deviation, Results, Tol, compare_max, count_true, match
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.losses.base import Comparison, ImageLoss
 from clsplat.losses.image import L1, L2, Dssim, add_losses, view_error
@@ -69,11 +69,11 @@ def check_loss(
     value, gradient = oracle(x.astype(np.float64), y.astype(np.float64))
     value_kernel = {"ssim_gradient": "ssim_maps"}.get(kernel, kernel)
     values = np.array([actual.value()]), np.array([weight * value])
-    yield compare_max(value_kernel, f"value of {label}", *values, SUM, floor=1e-2)
+    yield compare_max(value_kernel, f"value of {label}", *values, Tol.SUM, floor=1e-2)
     planes, camera = comparison.gradient.get(), comparison.camera
     error = np.abs(planes[:, : camera.height, : camera.width] - weight * gradient).max()
     max_gradient = max(float(np.abs(weight * gradient).max()), 1e-30)
-    yield Deviation(kernel, f"gradient of {label}", float(error) / max_gradient, LOSS_GRADIENT)
+    yield Deviation(kernel, f"gradient of {label}", float(error) / max_gradient, Tol.LOSS_GRADIENT)
     yield match(kernel, f"gradient outside the image, {label}", blank_image(camera, planes), 0.0)
 
 
@@ -95,9 +95,9 @@ def losses_that_add_up(device: Device, rng: np.random.Generator) -> Results:
         truths = [(weight * value, weight * gradient) for weight, _, f in chosen for value, gradient in (f(*exact),)]
         label, expected = ", ".join(value.name for value in values), sum(gradient for _, gradient in truths)
         error = np.abs(comparison.gradient.get()[:, :20, :50] - expected).max() / np.abs(expected).max()
-        yield Deviation("ssim_gradient", f"sum of the gradients of {label}", float(error), LOSS_GRADIENT)
+        yield Deviation("ssim_gradient", f"sum of the gradients of {label}", float(error), Tol.LOSS_GRADIENT)
         actual, truth = np.array([value.value() for value in values]), np.array([value for value, _ in truths])
-        yield compare_max("ssim_gradient", f"values of {label}", actual, truth, SUM, floor=1e-2)
+        yield compare_max("ssim_gradient", f"values of {label}", actual, truth, Tol.SUM, floor=1e-2)
 
 
 @CHECKS.add("view_error", "sum_errors")
@@ -110,9 +110,9 @@ def errors_of_views(device: Device, rng: np.random.Generator) -> Results:
         rows = comparison.workspace.array("row_errors", (3, comparison.camera.rows)).get()
         values = [table.astype(np.float64) for table in (gradient, x, y)]
         expected = np.array([[ref.view_error(*(v[c, row] for v in values)) for row in range(height)] for c in range(3)])
-        yield compare_max("view_error", f"errors of rows, {label}", rows[:, :height], expected, SUM, floor=1e-2)
+        yield compare_max("view_error", f"errors of rows, {label}", rows[:, :height], expected, Tol.SUM, floor=1e-2)
         yield match("view_error", f"errors of rows outside the image, {label}", rows[:, height:], 0.0)
-        yield compare_max("sum_errors", f"error of {label}", actual, np.array([expected.sum()]), SUM)
+        yield compare_max("sum_errors", f"error of {label}", actual, np.array([expected.sum()]), Tol.SUM)
 
 
 @CHECKS.add("unpack_pixels", "apply_mask", "change_background")
@@ -175,7 +175,7 @@ def check_haar(
     grad_taps = ref.haar_gradient(exact, gradient, taps, mask)
     grad_scalars = np.array([grad_taps[0] - grad_taps[1], grad_taps.sum()]) / np.sqrt(2)
     actual, size = np.array([*derivatives.values()]), float(np.sqrt(gradient.size))
-    yield compare_max("haar_backward", f"gradients of the taps, {label}", actual, grad_scalars, SUM, floor=size)
+    yield compare_max("haar_backward", f"gradients of the taps, {label}", actual, grad_scalars, Tol.SUM, floor=size)
 
 
 @CHECKS.add("haar_forward", "haar_backward")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, SUM, Checks, Results, compare, compare_max, count_true, match
+from clsplat.conformance.check import Checks, Results, Tol, compare, compare_max, count_true, match
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.formats.splats import MOTION, STATIC_LOG_DURATION, WIDTHS, motion_fields, motion_width
 from clsplat.gaussians.structs import GaussianGradients, moment_tables
@@ -66,8 +66,8 @@ def check_motion_at_time(device: Device, rng: np.random.Generator, count: int, w
     actual, grad_center = gradients[MOTION].get()[:, :count].T, gradients["logit_opacity"].get()[0, :count]
     kernel = "turn_backward" if has_rotation else "move_backward"
     for name, columns in motion_fields(width).items():
-        yield compare(kernel, f"gradient of {name}, {label}", actual[:, columns], grad_motion[:, columns], CONIC)
-    yield compare("move_backward", f"gradient of the logit at the center, {label}", grad_center, grad_logit, CONIC)
+        yield compare(kernel, f"gradient of {name}, {label}", actual[:, columns], grad_motion[:, columns], Tol.CONIC)
+    yield compare("move_backward", f"gradient of the logit at the center, {label}", grad_center, grad_logit, Tol.CONIC)
 
 
 def check_zero_motion(device: Device, rng: np.random.Generator) -> Results:
@@ -109,7 +109,7 @@ def check_step(device: Device, rng: np.random.Generator, count: int, width: int,
     yield match("motion_step", f"values of invisible rows, {label}", actual[~is_visible], initial[~is_visible])
     yield compare_max("motion_step", f"values, {label}", actual, values, 2e-5, floor=1.0)
     for moment, expected in zip(moment_tables(MOTION), (m, v), strict=True):
-        yield compare("motion_step", f"moments, {label}", gaussians.get(moment), expected, 3 * SUM)
+        yield compare("motion_step", f"moments, {label}", gaussians.get(moment), expected, 3 * Tol.SUM)
 
 
 @CHECKS.add("move_forward", "turn_forward", "move_backward", "turn_backward", "motion_step")

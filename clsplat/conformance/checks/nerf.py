@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clsplat.conformance.check import GRADIENT, SUM, Checks, Results, compare, compare_max, match
+from clsplat.conformance.check import Checks, Results, Tol, compare, compare_max, match
 from clsplat.conformance.checks.images import to_planes
 from clsplat.conformance.reference import nerf as ref
 from clsplat.conformance.reference.training import adam_step
@@ -251,7 +251,7 @@ def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, posit
         expected = grid.level.forward(grid.entries(case.parameters), means, variances)
         yield compare_max("grid_forward", f"level {number}, {label}", features[:, rows], expected, 5e-5, 1.0)
         expected, grad_entries = grid.level.backward(sample_gradients[:, rows], means, variances), grid.entries(actual)
-        yield compare("grid_backward", f"level {number}, {label}", grad_entries, expected, GRADIENT)
+        yield compare("grid_backward", f"level {number}, {label}", grad_entries, expected, Tol.GRADIENT)
         is_zero = np.all(expected == 0, axis=1)
         yield match("grid_backward", f"entries without samples, level {number}, {label}", grad_entries[is_zero], 0.0)
     yield match("grid_backward", f"parameters of the network, {label}", actual[: shape.network_length], 0.0)
@@ -283,7 +283,9 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
             yield from comparison.deviations(f"{count} rays, {level.samples} samples")
             case.levels.differentiate(parameters, level, RayTarget(case.planes, scale, errors), gradient)
             squares = (comparison.differences[:count] ** 2).sum(axis=1)
-            yield compare_max("composite_backward", f"squares of {count} rays", errors.get()[2:], squares, SUM, 1e-3)
+            yield compare_max(
+                "composite_backward", f"squares of {count} rays", errors.get()[2:], squares, Tol.SUM, 1e-3
+            )
             grad_weights, grad_position = comparison.backward(count)
             expected.append(grad_weights)
             for number, grid in enumerate(case.grid_levels()):
@@ -292,7 +294,7 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
         for number, (grid, truth) in enumerate(zip(case.grid_levels(), grad_entries, strict=True)):
             label = f"gradients of level {number} of the grid, {count} rays, skip {case.shape.skip}"
             for name in ("dense_backward", "grid_backward"):
-                yield compare(name, label, grid.entries(gradient.get()), truth, GRADIENT)
+                yield compare(name, label, grid.entries(gradient.get()), truth, Tol.GRADIENT)
         yield from _check_gradient(case.shape, gradient.get(), expected, f"{count} rays")
 
 
@@ -303,8 +305,8 @@ def _check_gradient(shape: FieldShape, gradient: NDArray[Any], expected: list[re
         grad_weights, grad_biases = (sum(level[number][index] for level in expected) for index in (0, 1))
         kernel = "composite_backward" if layer.name in ("density", "color") else "dense_backward"
         for name in (kernel, "dense_weights", "dense_sums"):
-            yield compare(name, f"weights of {layer.name}, {label}", weights, np.asarray(grad_weights), GRADIENT)
-        yield compare("dense_biases", f"biases of {layer.name}, {label}", biases, np.asarray(grad_biases), GRADIENT)
+            yield compare(name, f"weights of {layer.name}, {label}", weights, np.asarray(grad_weights), Tol.GRADIENT)
+        yield compare("dense_biases", f"biases of {layer.name}, {label}", biases, np.asarray(grad_biases), Tol.GRADIENT)
         table = is_used[layer.first : layer.first_bias].reshape(layer.rows, layer.columns)
         table[np.ix_(layer.inputs, range(layer.outputs))] = True
         is_used[layer.first_bias : layer.first_bias + layer.outputs] = True

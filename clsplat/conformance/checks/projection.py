@@ -8,19 +8,7 @@ import scipy
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import (
-    CONIC,
-    DEPTH,
-    PROJECTION,
-    SUM,
-    Checks,
-    Deviation,
-    Results,
-    compare,
-    compare_max,
-    count_true,
-    match,
-)
+from clsplat.conformance.check import Checks, Deviation, Results, Tol, compare, compare_max, count_true, match
 from clsplat.conformance.scenes import (
     Case,
     add_world_filter,
@@ -72,17 +60,19 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     )
     is_rendered &= truth.visible
     record = records[is_rendered]
-    yield compare_max(kernel, f"means, {label}", record[:, :2], truth.mean2d[is_rendered], PROJECTION, floor=50)
+    yield compare_max(kernel, f"means, {label}", record[:, :2], truth.mean2d[is_rendered], Tol.PROJECTION, floor=50)
     conic = record_covariances(record) if case.pixel_box else record[:, 2:5]
     size = np.maximum(np.linalg.norm(truth.conic[is_rendered], axis=1), 1e-30)
     error = np.linalg.norm(conic - truth.conic[is_rendered], axis=1) / size
-    yield Deviation(kernel, f"conics, {label}", float(error.max(initial=0)), CONIC)
-    yield compare_max(kernel, f"opacities, {label}", record[:, 5], truth.opacity[is_rendered], PROJECTION)
-    yield compare_max(kernel, f"colors, {label}", record[:, 6:9], truth.color[is_rendered], PROJECTION, floor=1)
-    yield compare_max(kernel, f"depths, {label}", keys[is_rendered].view(np.float32), truth.depth[is_rendered], DEPTH)
+    yield Deviation(kernel, f"conics, {label}", float(error.max(initial=0)), Tol.CONIC)
+    yield compare_max(kernel, f"opacities, {label}", record[:, 5], truth.opacity[is_rendered], Tol.PROJECTION)
+    yield compare_max(kernel, f"colors, {label}", record[:, 6:9], truth.color[is_rendered], Tol.PROJECTION, floor=1)
+    yield compare_max(
+        kernel, f"depths, {label}", keys[is_rendered].view(np.float32), truth.depth[is_rendered], Tol.DEPTH
+    )
     if not case.pixel_box:
         power_min = -np.log(255 * truth.opacity[is_rendered])
-        yield compare_max(kernel, f"reaches, {label}", record[:, 13], power_min, PROJECTION, floor=1)
+        yield compare_max(kernel, f"reaches, {label}", record[:, 13], power_min, Tol.PROJECTION, floor=1)
     is_culled = records[:, 5] <= 0
     yield count_true(
         kernel, f"culled splats, {label}", (keys[is_culled] != CULLED) | (records[is_culled] != 0).any(axis=1)
@@ -128,9 +118,9 @@ def check_gradient(device: Device, case: Case, rng: np.random.Generator, label: 
     expected = expected_gradients(case, truth, pixel_sums[:, : gaussians.count].astype(np.float64).T)
     for name, array in gradients.arrays.items():
         value = array.get()[:, : gaussians.count].T
-        yield compare("project_backward", f"gradients of {name}, {label}", value, expected[name], CONIC)
+        yield compare("project_backward", f"gradients of {name}, {label}", value, expected[name], Tol.CONIC)
     value = gradients.mean2d.get()[:, : gaussians.count].T
-    yield compare("project_backward", f"gradients of the projected means, {label}", value, expected["mean2d"], CONIC)
+    yield compare("project_backward", f"gradients of projected means, {label}", value, expected["mean2d"], Tol.CONIC)
 
 
 def check_long_splats(device: Device, case: Case, rng: np.random.Generator, label: str) -> Results:
@@ -271,7 +261,7 @@ def gradients_of_the_projection(device: Device, rng: np.random.Generator) -> Res
 
 @CHECKS.add("project_backward")
 def gradients_of_needles(device: Device, rng: np.random.Generator) -> Results:
-    """Compare the gradients of long splats in a blended image.  Unstable formulas lose most digits there."""
+    """Compare the gradients of long splats in a blended image.  Unstable formulas lose most digits for such splats."""
     for aspect in ASPECT_RATIOS:
         for name, settings in LONG_FILTERS.items():
             case = needle_case(rng, 12, aspect, **settings)
@@ -296,7 +286,7 @@ def world_filter(device: Device, rng: np.random.Generator) -> Results:
         means = case.parameters["means"].astype(np.float64)
         interval = ref.sampling_interval(means, cameras, [view.camera.fx for view in views])
         actual = gaussians.get("filter_variance")[:, 0]
-        yield compare_max("filter_variance", f"variances, {count} Gaussians", actual, 0.2 * interval**2, SUM)
+        yield compare_max("filter_variance", f"variances, {count} Gaussians", actual, 0.2 * interval**2, Tol.SUM)
 
 
 @CHECKS.add("paint_depth")
@@ -310,7 +300,7 @@ def depth(device: Device, rng: np.random.Generator) -> Results:
         z = case.parameters["means"].astype(np.float64) @ pose[2, :3] + pose[2, 3]
         colors = frame.splats.get()[:, 6:9]
         expected = np.stack([z, np.ones(count), np.zeros(count)], axis=1)
-        yield compare_max("paint_depth", f"depths, {count} Gaussians", colors, expected, DEPTH, floor=1)
+        yield compare_max("paint_depth", f"depths, {count} Gaussians", colors, expected, Tol.DEPTH, floor=1)
 
 
 # poses.cl: gradients of the pose and the focal length of a camera.
@@ -333,7 +323,7 @@ def check_pose(device: Device, case: Case, rng: np.random.Generator, label: str)
     rotation = case.camera().rotation
     values = {"translation": rotation @ actual[:3], "rotation": rotation @ actual[3:6], "focal length": actual[6:]}
     for (name, value), exact in zip(values.items(), expected, strict=True):
-        yield compare("pose_gradient", f"gradient of the {name}, {label}", value[None], exact[None], CONIC)
+        yield compare("pose_gradient", f"gradient of the {name}, {label}", value[None], exact[None], Tol.CONIC)
 
 
 @CHECKS.add("pose_gradient")
@@ -347,4 +337,4 @@ def poses(device: Device, rng: np.random.Generator) -> Results:
         yield from check_pose(device, case, rng, f"filters of {variance:g} px², compensate {compensate:g}")
     yield from check_pose(device, clamped_case(rng), rng, "rays beyond the limits")
     case = replace(random_case(rng, 30), variance=0.0, pixel_box=1.0)
-    yield from check_pose(device, case, rng, "the pixel's box")
+    yield from check_pose(device, case, rng, "the box filter")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import SUM, Checks, Results, compare, compare_max, match
+from clsplat.conformance.check import Checks, Results, Tol, compare, compare_max, match
 from clsplat.conformance.checks.images import blank_image, to_planes
 from clsplat.conformance.scenes import Case, random_case
 from clsplat.gaussians.sky import DeviceSky
@@ -71,8 +71,8 @@ def check_sky(device: Device, rng: np.random.Generator, width: int, height: int,
     transmittance = view.magnitude.astype(np.float64)
     expected = ref.sky_gradient(side, view.directions, transmittance, gradient.astype(np.float64)).reshape(-1, 3)
     visible = view.skies.runs(view.camera, side).texels.get()
-    yield compare("sky_backward", f"derivatives, {label}", grad_texels.get().T, expected[visible], SUM)
-    yield compare("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, expected[visible], SUM)
+    yield compare("sky_backward", f"derivatives, {label}", grad_texels.get().T, expected[visible], Tol.SUM)
+    yield compare("sky_gather", f"derivatives by texels, {label}", grad_texels.get().T, expected[visible], Tol.SUM)
     yield match("sky_gather", f"texels outside the view, {label}", np.delete(expected, visible, axis=0), 0.0)
 
 
@@ -94,7 +94,7 @@ def check_cover(device: Device, rng: np.random.Generator, width: int, height: in
         yield compare_max(kernel, f"T dL/dT, {label}", view.crop(actual), expected, WEIGHT, floor=scale)
     yield match("sky_cover", f"T dL/dT outside the image, {label}", blank_image(view.camera, actual[None]), 0.0)
     value = np.array([scale * sums.get().sum(dtype=np.float64)])
-    yield compare_max("sky_cover", f"loss, {label}", value, np.array([loss]), SUM, floor=0.1)
+    yield compare_max("sky_cover", f"loss, {label}", value, np.array([loss]), Tol.SUM, floor=0.1)
 
 
 @CHECKS.add("sky_forward", "sky_backward", "sky_gather")

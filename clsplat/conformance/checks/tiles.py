@@ -14,8 +14,9 @@ from clsplat.render.tiles import SORT_CAPACITY, Sort, Tiler
 from clsplat.render.workspace import Workspace
 
 CHECKS = Checks()
-LENGTHS = (0, 1, 2, 3, 127, 128, 129, 1023, 1024, 1025, 0, 2047, 2048, 2049, 4097, 300, 0)  # around a run's (common.h)
-# around a team's run (8 * 64) and the shortest run of one item
+# around the length of a run in common.h
+LENGTHS = (0, 1, 2, 3, 127, 128, 129, 1023, 1024, 1025, 0, 2047, 2048, 2049, 4097, 300, 0)
+# around the run of a team (8 * 64), and the shortest run of one item
 COUNTS = (1, 63, 64, 65, 511, 513, 1025, 16385, 40001)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance import reference as ref
-from clsplat.conformance.check import CONIC, SUM, Checks, Deviation, Results, compare, compare_max, match
+from clsplat.conformance.check import Checks, Deviation, Results, Tol, compare, compare_max, match
 from clsplat.conformance.checks.blending import BACKGROUND
 from clsplat.conformance.checks.projection import COUNTS as DROPOUT_COUNTS
 from clsplat.conformance.checks.projection import check_gradient, check_record, expected_gradients, project_records
@@ -59,7 +59,7 @@ def check_step(device: Device, rng: np.random.Generator, count: int) -> Results:
         # values are rounded to float32, and their changes to 2e-5 of the largest change
         yield compare_max("adam_step", label, actual, values[name], 3e-7, floor=2e-5 * max_change / 3e-7)
         # 1 - 0.999f is off by 1.3e-5 in float32
-        for moment, expected, bound in zip(moment_tables(name), moments[name], (SUM, 3 * SUM), strict=True):
+        for moment, expected, bound in zip(moment_tables(name), moments[name], (Tol.SUM, 3 * Tol.SUM), strict=True):
             max_moment = float(np.abs(expected).max())
             actual = model.gaussians.get(moment)
             yield compare_max("adam_step", f"moments of {label}", actual, expected, bound, floor=0.1 * max_moment)
@@ -99,15 +99,15 @@ def check_fused(
     grad_mean2d = adam.update(model, frame, pixel_sums, rates, statistics=stats.update_arguments()).get()[:, :count].T
     sums = pixel_sums.array.get()[:, :count].T.astype(np.float64)
     expected = expected_gradients(case, case.project(), sums[:, :PIXEL_SUMS])
-    yield compare(kernel, f"gradients of the projected means, {label}", grad_mean2d, expected["mean2d"], CONIC)
+    yield compare(kernel, f"gradients of the projected means, {label}", grad_mean2d, expected["mean2d"], Tol.CONIC)
     planes, is_visible = sums[:, ABS_X:] if stats.pixel_sums > ABS_X else grad_mean2d, frame.radius.get()[:count] > 0
     norms = 1 + is_visible * ref.screen_gradient(planes.astype(np.float64), *case.size)
-    yield compare_max(kernel, f"{statistic}, {label}", stats.total(statistic).get()[0, :count], norms, SUM)
+    yield compare_max(kernel, f"{statistic}, {label}", stats.total(statistic).get()[0, :count], norms, Tol.SUM)
     yield match(kernel, f"views, {label}", stats.view_count.get()[0, :count], 2.0 + is_visible)
     for name in PARAMETERS:
         moment1, moment2 = (gaussians.get(table).astype(np.float64) for table in moment_tables(name))
-        yield compare(kernel, f"first moment of {name}, {label}", moment1, 0.1 * expected[name], CONIC)
-        yield compare(kernel, f"second moment of {name}, {label}", moment2, 1e-3 * expected[name] ** 2, 2 * CONIC)
+        yield compare(kernel, f"first moment of {name}, {label}", moment1, 0.1 * expected[name], Tol.CONIC)
+        yield compare(kernel, f"second moment of {name}, {label}", moment2, 1e-3 * expected[name] ** 2, 2 * Tol.CONIC)
         step = rates[name] * (moment1 / 0.1) / (np.sqrt(moment2 / 1e-3) + 1e-15)
         initial = case.parameters[name].astype(np.float64)
         floor = 2e-5 * max(float(np.abs(step).max()), 1e-30) / 3e-7
@@ -115,7 +115,7 @@ def check_fused(
 
 
 def check_rows(device: Device, rng: np.random.Generator, case: Case, label: str) -> Results:
-    """Compare the fifth update by each kernel, of visible rows only, from the same gradients and moments."""
+    """Compare the fifth update of visible rows by each kernel.  All kernels get the same gradients and moments."""
     count, rates, parameters = len(case.parameters["means"]), Rates().at(3, extent=2.0), case.parameters
     moments = {
         name: (rng.normal(size=values.shape), rng.uniform(0.5, 2, values.shape))
@@ -146,7 +146,12 @@ def check_rows(device: Device, rng: np.random.Generator, case: Case, label: str)
             actual = gaussians.get(table)
             yield match(kernel, f"{table} of invisible rows, {label}", actual[~is_visible], truth[~is_visible])
             yield compare_max(
-                kernel, f"{table} of visible rows, {label}", actual[is_visible], truth[is_visible], 3 * SUM, floor=0.1
+                kernel,
+                f"{table} of visible rows, {label}",
+                actual[is_visible],
+                truth[is_visible],
+                3 * Tol.SUM,
+                floor=0.1,
             )
 
 
@@ -198,7 +203,7 @@ def check_penalty(
     actual = penalty.add(inputs).value()
     value, gradient = oracle(case.parameters[parameter].astype(np.float64))
     kernel, label = str(getattr(penalty, "type", "penalty")), f"{count} Gaussians"
-    yield compare_max(kernel, f"value, {label}", np.array([actual]), np.array([3 * value]), SUM, floor=1e-7)
+    yield compare_max(kernel, f"value, {label}", np.array([actual]), np.array([3 * value]), Tol.SUM, floor=1e-7)
     actual_gradient = gradients[parameter].get()[:, :count].T.astype(np.float64) - 0.25
     floor = 1e-2 * max(1.0, float(np.abs(3 * gradient).max()))
     yield compare_max(kernel, f"gradient, {label}", actual_gradient, 3 * gradient, 1e-4, floor)
@@ -315,7 +320,9 @@ def check_deferred(device: Device, rng: np.random.Generator, count: int) -> Resu
     immediate = train(device, case.model(device), masks, gradients, "all")
     max_change = max(float(np.abs(values - initial).max(initial=0)), 1e-6)
     yield compare_max("replay_updates", f"{count} Gaussians", actual["sh_rest"], values, 3e-7, 2e-5 * max_change / 3e-7)
-    for name, expected, bound in zip(DeferredHarmonics.names[1:], (moment1, moment2), (SUM, 3 * SUM), strict=True):
+    for name, expected, bound in zip(
+        DeferredHarmonics.names[1:], (moment1, moment2), (Tol.SUM, 3 * Tol.SUM), strict=True
+    ):
         floor = 0.1 * float(np.abs(expected).max(initial=0))
         yield compare_max("replay_updates", f"{name}, {count} Gaussians", actual[name], expected, bound, floor)
     for name in DeferredHarmonics.names:
@@ -336,7 +343,7 @@ def averages(device: Device, rng: np.random.Generator) -> Results:
 
 
 def check_average(device: Device, rng: np.random.Generator, count: int) -> Results:
-    """Compare the average over three steps.  If there are several rows, the last is added after the first step."""
+    """Compare the average over three steps.  If there are several rows, the last is created after the first step."""
     steps = [random_case(rng, count).parameters for _ in range(3)]
     gaussians = random_case(rng, count).model(device).gaussians
     adam.attach_average(gaussians)
@@ -356,7 +363,7 @@ def check_average(device: Device, rng: np.random.Generator, count: int) -> Resul
         expected = values.mean(axis=0)
         expected[-1] = values[1 if count > 1 else 0 :, -1].mean(axis=0)
         actual = gaussians.get(name)
-        yield compare_max("take_average", f"average of {name}, {count} Gaussians", actual, expected, SUM, floor=1)
+        yield compare_max("take_average", f"average of {name}, {count} Gaussians", actual, expected, Tol.SUM, floor=1)
 
 
 # dropout.cl, and the projection of the remaining Gaussians.

@@ -237,7 +237,7 @@ class HashLevel:
         return grad_table
 
     def _masked_corners(self, positions: Floats, variances: Floats) -> tuple[NDArray[np.int64], Floats]:
-        """Return what `corners` returns, with weights of 0 for samples outside of the cube."""
+        """Return the result of `corners`, with weights of 0 for samples outside the cube."""
         is_inside = np.all((positions >= 0) & (positions <= 1), axis=1)
         entries, weights = self.corners(np.where(is_inside[..., None], positions, 0.5))
         return entries, weights * (is_inside * self.weights(variances))[:, None]

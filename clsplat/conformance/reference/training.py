@@ -145,7 +145,7 @@ def adc_actions(
 ) -> NDArray[Any]:
     """Return KEEP, CLONE, SPLIT or PRUNE for each Gaussian, [N].
 
-    Pruning is last, and applies to the new rows: copies and children have their parent's opacity, and children its
+    Pruning is last, and applies to the new rows: copies and children have their parent's opacity, and children have its
     scale divided by 1.6.  split_gradient: the statistic for splits, such as the absolute gradient; None: `gradient`.
     """
     split_gradient = gradient if split_gradient is None else split_gradient

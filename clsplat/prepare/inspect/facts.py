@@ -290,7 +290,7 @@ class Facts:
     same_but_case: list[list[str]]  # groups of names that differ only in upper and lower case
     left_out: list[str]  # sentences about files that `prepare` does not read as photographs
     hint: str  # text that names similar files on disk, if files are missing
-    notes: list[str]  # sentences about files that were found under other paths than the dataset states
+    notes: list[str]  # sentences about files that were not at the paths in the dataset but were found elsewhere
     faults: list[str]  # reasons why parts of the dataset cannot be read
     refusal: str  # reason why training does not start
 
@@ -438,7 +438,7 @@ def _measure_photographs(parts: Parts, missing_files: set[Path]) -> PhotographFa
 
 
 def _add_photograph(facts: PhotographFacts, view: View, name: str, path: Path, file: ImageFile) -> None:
-    """Add the faults of a view's photograph or mask to the facts.  name: its name in the facts."""
+    """Add the faults of a view's photograph or mask to the facts.  name: the name of the file in the facts."""
     camera = view.lens or view.camera
     if file.is_truncated:
         facts.cut.append(name)

@@ -181,7 +181,8 @@ def _check_comparison(facts: Facts) -> Iterator[Finding]:
     if steps := facts.comparison.steps:
         examples = _join([f"{a} to {b}: {ratio:.2g} times" for a, b, ratio in steps])
         fault = (
-            f"{_count_with_verb(len(steps), 'photo')} more than twice as bright or dark as the one before ({examples})"
+            f"{_count_with_verb(len(steps), 'photo')} more than twice or less than half as bright as the one before "
+            f"({examples})"
         )
         remedy = "without exposures in EXIF, --set optimize.modules.exposure={} fits the exposure of each photo"
         yield Finding("note", fault, remedy)
@@ -220,7 +221,7 @@ def _check_poses(facts: Facts) -> Iterator[Finding]:
         yield Finding("note", "there are no test views", "quality is measured on training views only")
     if facts.same_center:
         fault = "all cameras are at the same position"
-        yield Finding("warning", fault, "they show no depth; take photos from different positions")
+        yield Finding("warning", fault, "depth cannot be estimated; take photos from different positions")
     if facts.outlier_cameras:
         count = _count_with_verb(len(facts.outlier_cameras), "camera")
         fault = f"{count} far away from all others ({_join(facts.outlier_cameras)})"
@@ -246,7 +247,7 @@ def _check_points(facts: Facts) -> Iterator[Finding]:
         return
     if points.count < MIN_POINTS:
         fault = f"there {_count_with_verb(points.count, 'point', 'only ')}"
-        yield Finding("warning", fault, "also try --set init.source=random")
+        yield Finding("warning", fault, "compare with a run that has --set init.source=random")
     if points.not_finite:
         fault = f"{_count_with_verb(points.not_finite, 'point')} not finite"
         yield Finding("warning", fault, "they are ignored; the file may be damaged: export it again")
@@ -265,7 +266,7 @@ def _check_points(facts: Facts) -> Iterator[Finding]:
 
 
 def _check_coverage(points: PointFacts) -> Iterator[Finding]:
-    axes = "the poses do not match these points, or their axes are flipped; export both again together"
+    axes = "the poses do not match the points, or have flipped axes; export poses and points together"
     if points.behind is not None and points.behind > MAX_BEHIND:
         yield Finding("warning", f"{100 * points.behind:.0f} % of the points are behind all cameras", axes)
     elif points.in_two is not None and points.in_two < MIN_IN_TWO:
@@ -361,7 +362,7 @@ def summarize(facts: Facts) -> dict[str, str]:
             camera
         )
     if facts.extent is not None:
-        lines["extent"] = f"{facts.extent:.4g} scene units, of the cameras"
+        lines["extent"] = f"{facts.extent:.4g} scene units, the radius of the cameras"
         if facts.outlier_cameras:
             lines["extent"] += f", without {len(facts.outlier_cameras)} far away from all others"
     if any(facts.origin):
@@ -391,7 +392,7 @@ def describe_camera(camera: CameraFacts) -> str:
     focal = f"{fx:.1f}" if abs(fx - fy) < 0.05 else f"{fx:.1f}, {fy:.1f}"
     distortion = "unbounded" if camera.distortion is None else f"up to {camera.distortion:.1f} px"
     lens = f", distortion {distortion}, {100 * camera.kept:.0f} % kept" if camera.distortion != 0 else ""
-    lens += f", cut into {pluralize(camera.faces, 'face')} of a cube" if camera.faces else ""
+    lens += f", split into {pluralize(camera.faces, 'cube face')}" if camera.faces else ""
     size = f"{camera.width}x{camera.height}"
     return f"{camera.model} {size}, focal length {focal} px{lens}; {pluralize(camera.views, 'view')}"
 

@@ -22,7 +22,7 @@ from clsplat.viewer.video.paths import Size, check_fps, check_size
 
 SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS = 0x18538067, 0x1654AE6B, 0xAE, 0x1254C367, 0x7373, 0x63C0
 PARENTS = {SEGMENT, TRACKS, TRACK, TAGS, TAG, TARGETS}
-CLUSTER = 0x1F43B675  # element of the first frames, which follows the tracks
+CLUSTER = 0x1F43B675  # EBML ID of the first cluster of frames, which follows the tracks
 UIDS = {0x73C5, 0x63C5}  # TrackUID, and TagTrackUID
 HEAD = 1 << 16  # bytes at the start of a file that contain all UIDs
 

@@ -21,8 +21,8 @@ PROBES = 8  # views whose depths determine the range of colors
 PROBE_SIDE = 240  # px
 OPAQUE = 0.5  # alpha above which the depth of a pixel counts
 QUANTILES = 0.02, 0.98  # of the depths, for near and far
-MIN_RANGE = 1e-3  # relative to far
-MAX_STEP = 0.05  # between the depths of neighbors, relative: normals are unknown at larger steps
+MIN_RANGE = 1e-3  # smallest difference between near and far, relative to far
+MAX_STEP = 0.05  # largest relative difference between neighboring depths; normals are unknown at larger steps
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class Rig:
     def from_views(cls, views: Sequence[View], points: Floats) -> "Rig":
         """Return a rig without outlier cameras or non-finite points.  Raises DataError if there is no view."""
         if not views:
-            raise DataError("a camera path needs the cameras of a scene, but this scene has none; use another one")
+            raise DataError("a camera path needs the cameras of a scene, but this scene has none; use another scene")
         is_outlier = outlier_cameras(views)
         points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         stride = -(-len(points) // MAX_POINTS) or 1
@@ -125,7 +125,7 @@ def normalize(vectors: Floats) -> Floats:
 Indices = NDArray[np.intp]
 DEGREE = 5  # of the B-spline
 SMOOTHING = 0.25  # distance of the curve from a view, relative to the median step between consecutive views
-UP_WEIGHT = 0.1  # weight of up vectors relative to positions, in units of the distance
+UP_WEIGHT = 0.1  # weight of up vectors relative to positions, multiplied by the distance of the target
 MAX_VIEWS = 1000  # in a tour, evenly sampled by name
 ROUNDS = 20  # of 2-opt
 
@@ -279,7 +279,7 @@ FOCUS_DEPTH = 0.75  # of a spiral, from near (0) to far (1) in inverse depth (Mi
 TURNS = 2  # of a spiral
 MAX_RADIUS = 0.3  # of a spiral, relative to the distance of its target; cameras may surround the scene
 ARC_FRACTION = 0.85  # of a photographed arc; at its ends, half of the image was not photographed
-TIME_WEIGHT = 1e-3  # of the full time range relative to a right angle, to choose among timestamps of one camera
+TIME_WEIGHT = 1e-3  # cost of the full time range if a right angle costs 1; selects among views of one camera
 MIN_AGREEMENT = 0.5  # length of the mean view direction below which the cameras have no common front
 
 
