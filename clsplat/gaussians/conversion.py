@@ -142,7 +142,7 @@ class Changes:
 
 
 def merged(model: Model, count: int) -> Model:
-    """Return a model with at most `count` Gaussians and those of its sky, by merging neighbors.  Raises ConfigError."""
+    """Merge neighbors until at most `count` Gaussians remain, without counting the sky.  Raises ConfigError."""
     if count < 1:
         raise ConfigError(f"--splats {count}: expected a number of Gaussians of at least 1")
     if model.motion is not None:

@@ -13,7 +13,7 @@ from clsplat.core.quaternions import multiply, unit_quaternions
 from clsplat.formats.splats import MOTION, STATIC_LOG_DURATION, Parameters, motion_fields
 
 MIN_PRESENCE = 1 / 255  # opacity factor below which a Gaussian is invisible
-MAX_LOGIT = 80.0  # larger logits are clamped before they fade
+MAX_LOGIT = 80.0  # larger logits are clamped before the opacity factor is applied
 
 
 def static_motion(count: int, width: int) -> NDArray[np.float32]:

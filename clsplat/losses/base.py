@@ -31,7 +31,7 @@ class Comparison:
     photograph: Array
     gradient: Array
     mask: Array | None = None  # [1, rows, stride] 0 or 1
-    step: int = 0  # global; schedules are evaluated at it
+    step: int = 0  # global step, at which schedules are evaluated
     accumulate: bool = False  # if False, the next loss overwrites the gradient
     depths: KnownDepths | None = None  # at pixels of the photograph, if a loss reads them
 

@@ -57,7 +57,7 @@ class CameraSums:
     views: list[str] = field(default_factory=list)
     renders: ImageSums = field(default_factory=ImageSums)
     photographs: ImageSums = field(default_factory=ImageSums)
-    static_mask: Mask | None = None  # static by the file, if there is one, and unmasked at all timestamps
+    static_mask: Mask | None = None  # marked as static by the file, if any, and unmasked at all timestamps
     has_static_file: bool = False
 
 

@@ -19,7 +19,7 @@ from clsplat.render.workspace import Workspace
 
 RAY_VALUES = int(constants("rays.cl")["RAY_VALUES"])
 PASS_SAMPLES = 8192  # samples per pass: their features stay in a CPU's caches
-RAYS = SAMPLES // LANES_MAX  # a multiple of this fills whole tiles, for any number of samples per ray
+RAYS = SAMPLES // LANES_MAX  # multiples of this number of rays fill whole tiles, for any number of samples per ray
 assert RAYS == BLOCK
 
 

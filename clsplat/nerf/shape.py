@@ -16,7 +16,7 @@ GRID = constants("grid.cl")
 FEATURES = int(GRID["GRID_FEATURES"])
 MAX_DISTANCE = 1e6  # units of the field: the squared ratio of two depths stays within float32
 Coordinate = Annotated[float, Field(ge=-MAX_DISTANCE, le=MAX_DISTANCE)]
-UNIT_MAX = 1e15  # largest unit in scene units, as values in a dataset; its inverse is the smallest
+UNIT_MAX = 1e15  # largest unit, in scene units, as for values in a dataset; the smallest unit is 1 / UNIT_MAX
 UnitLength = Annotated[float, Field(ge=1 / UNIT_MAX, le=UNIT_MAX)]
 MAX_INITIAL = 1e-4  # largest initial value of an entry (Müller et al. 2022, section 4)
 

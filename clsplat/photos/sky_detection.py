@@ -22,7 +22,7 @@ MIN_BLUE_MINUS_RED = 0.03
 MIN_BLUE = 0.3
 MAX_DEVIATION = 0.04  # standard deviation of the brightness in a square of 3 px
 UPPER_FRACTION = 1 / 3  # fraction of a photograph's height
-MIN_UNMASKED = 1 / 3  # fraction of the upper third; with fewer unmasked pixels, the sky is a fraction of this area
+MIN_UNMASKED = 1 / 3  # of the upper third: smallest area to which sky pixels are relative, if fewer are unmasked
 MIN_SKYWARD = 0.75  # fraction of the sky pixels above the horizon; if it is smaller, they show a wall or a table
 GROWTH = 2  # number of texels around observed sky that count as sky, since pixels near points are excluded
 Image = NDArray[np.uint8]
@@ -83,7 +83,7 @@ def build_sky_map(photos: Sequence[SkyEvidence], side: int) -> tuple[NDArray[np.
     """Return the initial colors of an environment map, [side * side, 3], and a mask of sky texels, [side * side].
 
     A texel is sky if a photograph shows sky in or near it, or if no photograph shows it.  Its color is the mean of its
-    sky pixels, or that of all sky pixels if it has none.  Returns None if no photograph shows sky.
+    sky pixels, or the mean of all sky pixels if it has none.  Returns None if no photograph shows sky.
     """
     color_sums, sky_weights, weights = np.zeros((side**2, 3)), np.zeros(side**2), np.zeros(side**2)
     for photo in photos:

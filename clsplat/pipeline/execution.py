@@ -64,7 +64,7 @@ class LocalExecution(Settings):
     engine: Annotated[str, BeforeValidator(_check_local_engine), Field(pattern=LOCAL_ENGINE)] = "inline"
     """inline: one after another in this process; local: one process per device of this machine, with a store."""
     devices: Literal["auto"] | Annotated[list[str], Field(min_length=1)] = "auto"
-    """Devices of this machine, named as for `--device`; auto: all that work; engine inline uses the first."""
+    """Devices of this machine, named as for `--device`; auto: all working devices; engine inline uses the first."""
     placement: Placement = Placement()
     """Which devices may run which cells."""
     packing: Annotated[int, Field(ge=1)] = 1

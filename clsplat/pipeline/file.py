@@ -44,14 +44,14 @@ class SceneSettings(Settings):
     levels: Annotated[int, Field(ge=1, le=8)] = 1
     """Number of image sizes in training, with divisors of `downscale`, twice `downscale`, four times `downscale`, …."""
     alpha: Alpha = "transparency"
-    """Use of the alpha channel of images: `transparency` blends them with the background, `mask` masks pixels out."""
+    """Use of the alpha channel of images: `transparency` blends images with the background, `mask` masks pixels out."""
     masks: InputPath | None = None
     """Folder of masks, if the dataset has none: `a.png` or `a.jpg.png` for the image a.jpg, of the same size, white
     where pixels are used.  Without a mask, all pixels of an image are used."""
     background: Literal["auto", "black", "white"] = "auto"
     """Color behind the scene; auto: white for Blender scenes, else black."""
     image_budget: Annotated[int, Field(gt=0)] | None = None
-    """Memory for images on the device, MiB; default: a quarter of its memory."""
+    """Memory for images on the device, MiB; default: a quarter of the device's memory."""
     holdout: Selection = HOLDOUT
     """Test views: every n-th image by name, starting with the first; 0: none; or {every, offset}, {names} or {file}.
     Names replace the split of a dataset that has one."""
@@ -172,7 +172,7 @@ class PipelineFile(Settings):
     """Plug-ins of the run: name and sha256.  A run writes them, and a resumed run needs them."""
 
     def check_conflicts(self) -> None:
-        """Raise ConfigError for the first two settings that exclude each other according to their classes."""
+        """Raise ConfigError for the first two settings whose classes declare that they exclude each other."""
         items = list(iter_settings(self))
         for path, settings in items:
             settings.check_pipeline(self)

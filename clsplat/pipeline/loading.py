@@ -148,7 +148,7 @@ def _validate(data: dict[str, Any], path: Path, document: Document) -> PipelineF
 def _raise_cause(data: dict[str, Any], overrides: Sequence[str], path: Path, document: Document) -> None:
     """Raise the error of the file without overrides, if any, or else the error of the first invalid override."""
     all_paths = [key.key_path for key in list_keys(_validate(data, path, document))]
-    conflict: tuple[str, ConfigError] | None = None  # by the override that caused it; a later one may resolve it
+    conflict: tuple[str, ConfigError] | None = None  # an override and its error; a later override may resolve it
     for override in overrides:
         names, _ = split(override)
         try:

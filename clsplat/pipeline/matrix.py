@@ -9,7 +9,7 @@
         densify.every: [100, 200]
       steps: 2000                              # per cell; schedules are stretched to fit
 
-Each run is a cell of the matrix, in a separate subfolder of the run folder.  Its name contains its value on each axis.
+Each run is a cell of the matrix, in a subfolder of the run folder.  The name of a cell contains its value on each axis.
 """
 
 import itertools
@@ -70,7 +70,7 @@ class Matrix(Settings):
     steps: Annotated[int, Field(ge=1)] | None = None
     """Steps of each cell's training; schedules are stretched to fit; default: as in the pipelines."""
     options: list[str] = Field([])
-    """Settings of all cells, as key=value.  A run adds --set and --scene to them in its copy of the file."""
+    """Settings of all cells, as key=value.  A run adds the values of --set and --scene in its copy of the file."""
 
     @model_validator(mode="after")
     def _check_axes(self) -> "Matrix":
@@ -103,7 +103,7 @@ class MatrixFile(Settings):
 class Cell:
     """A run of a matrix."""
 
-    name: str  # also of its folder
+    name: str  # name of the cell and of its folder
     pipeline: Pipeline
 
 

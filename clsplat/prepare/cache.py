@@ -56,7 +56,7 @@ class PlannedStep:
 
 
 def plan(steps: Sequence[Step], source: Path, root: Path) -> list[PlannedStep]:
-    """Return the steps for the photographs in `source`, each with its folder below `root` and any reason to run it.
+    """Return the steps for the photographs in `source`: each with its folder below `root`, and why it must run, if so.
 
     Raises DataError when the photographs cannot be read.
     """
@@ -222,7 +222,7 @@ def _find_fault(folder: Path) -> str:
 
 
 def _find_reason(step: Step, inputs: str, folder: Path, source: Path) -> str:
-    """Return why a step must run: its result is damaged, or what changed since the newest result; "" if it need not."""
+    """Return why a step must run: a damaged result, or what changed since the newest result.  "" if it need not run."""
     if folder.exists():
         fault = _find_fault(folder)
         return fault and f"{fault}; the result is recomputed"

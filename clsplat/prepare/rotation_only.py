@@ -31,7 +31,9 @@ Floats = NDArray[np.float64]
 
 
 def explain_missing_depth(pycolmap: ModuleType, database: Path, names: Set[str] | None = None) -> str:
-    """Return the reason why depth cannot be estimated from photographs, by default all, or "" if it may be possible.
+    """Explain why depth cannot be estimated from photographs; return "" if that may be possible.
+
+    names: the photographs; None: all.
 
     All good pairs are tested, since the best pair of each photograph may come from one of several viewpoints.  The
     reconstruction is not tested: even for a purely rotating camera, COLMAP may find parallax of a few degrees.  If the

@@ -176,7 +176,7 @@ class Undistort(Step):
     long_side: Positive | None = None
     """Longer side of the undistorted images in px; default: that of the photos."""
     undefined_pixels: UndefinedPixels = "crop"
-    """How to treat pixels that the photo does not cover: `crop` the image, or keep all of it and `mask` them."""
+    """How to treat pixels that the photo does not cover: `crop` them, or keep the entire image and `mask` them."""
 
     def make(self, source: Path, out: Path, excluded_folder: Path) -> dict[str, Any]:
         return {"images": undistort_scene(source, out, self.long_side, self.undefined_pixels)}

@@ -32,7 +32,7 @@ from clsplat.training.stage import Training
 def write_metrics(pipeline: Pipeline, run: Run) -> None:
     """Write the results of a run to metrics.json.  For each stage name, `files` has the last stage's first output."""
     training = next((stage.stage for stage in reversed(pipeline.stages) if isinstance(stage, Training)), "optimize")
-    # of this process, except for the training time, which includes earlier processes
+    # times of this process, except for the training time, which includes earlier processes
     seconds = {**run.status.seconds, training: run.train_seconds}
     output_paths = {stage.stage: path for stage in pipeline.stages for path in stage.outputs(run.out)[:1]}
     metrics = {

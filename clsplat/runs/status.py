@@ -99,7 +99,7 @@ def _advice(state: RunState) -> str:
         return ""
     if "cells" in status or state.checkpoints:
         return f"`{resume_command}` continues it"
-    if status.get("checkpoint"):  # it cannot continue without one
+    if status.get("checkpoint"):  # the run cannot continue without a checkpoint
         restart_command = f"`clsplat run {shell_quote(out / PIPELINE)} --out {shell_quote(out)} --restart`"
         return f"its checkpoints are missing; {restart_command} starts it over"
     return f"no checkpoint was saved; `{resume_command}` starts it over"

@@ -30,8 +30,8 @@ class Export(Scheduled):
 
     A world filter is baked into scales and opacities, so that any viewer can show the file.  A second PLY, with `_raw`
     in its name, contains the model as trained, with the filter as property `filter_3D`.  A learned sky is added
-    to the model as distant Gaussians.  Another file, with `_without_sky` in its name, contains the model without them;
-    clsplat renders it with the map of the sky, a file with `_sky.json` in its name.
+    to the model as distant Gaussians.  A file with `_without_sky` in its name contains the model without them, and
+    clsplat renders that file with the map of the sky in the file with `_sky.json` in its name.
     """
 
     stage: Literal["export"] = "export"

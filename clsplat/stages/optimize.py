@@ -243,8 +243,8 @@ class Optimize(ValidatedTraining):
     rates: Rates = Rates()
     """Learning rates of the Gaussians' parameters."""
     update: Rows = "all"
-    """Gaussians that a step updates: `all`; `seen`, where culled Gaussians keep their parameters and moments; or
-    `deferred`, with the same bits as `all`, where `sh_rest` of culled Gaussians is updated when a view sees them."""
+    """Gaussians that a step updates.  `seen`: culled Gaussians keep their parameters and moments.  `deferred`:
+    `sh_rest` of culled Gaussians is updated later, when a view sees them again; the bits are those of `all`."""
     views_per_update: AtLeastOne = 1
     """Number of views whose gradients are averaged for an update, at each step that is a multiple of this number.
     Needs `update: all`."""
@@ -314,7 +314,7 @@ class Optimize(ValidatedTraining):
         trainer = self._create_trainer(run, views, last_step)
         sampler = Sampler(run.scene.split("train"), views, run.seed)
         memory, count = run.memory_plan(), run.model.gaussians.count
-        if run.harmonics != "auto" or memory.host == 0:  # else it was checked before the harmonics moved to the host
+        if run.harmonics != "auto" or memory.host == 0:  # else checked before the harmonics moved to the host
             memory.check(count, offload_advice(run))
         is_tight = memory.host or memory.limit < MEMORY_MARGIN * count
         LOG.log(logging.INFO if is_tight else logging.DEBUG, memory.text(count))

@@ -83,7 +83,7 @@ def slot_from_worker(address: str, worker: dict[str, Any]) -> DeviceSlot | None:
 def find_slots(worker: str, devices: list[str] | None = None, packing: int = 1) -> list[DeviceSlot]:
     """Return slots for the working devices of this machine, or for named devices, with their bits classes.
 
-    packing: number of runs that share a CPU; each run has its slot.
+    packing: number of runs that share a CPU, with one slot per run.
     Raises DeviceError if no device or a named device does not work, and ConfigError if there are more runs than cores.
     """
     infos = list_devices()

@@ -148,7 +148,7 @@ class Dispatcher:
         )
 
     def _require_class(self, classes: Sequence[str]) -> None:
-        """Raise DeviceError if there are devices, but for NO_DEVICE_TIMEOUT_S seconds none of the chosen class."""
+        """Raise DeviceError if only devices of other classes have been available for NO_DEVICE_TIMEOUT_S seconds."""
         now = time.monotonic()
         if not self.is_same or not classes or self.bits in classes or self._running:
             self._last_available = now

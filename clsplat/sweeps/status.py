@@ -42,7 +42,7 @@ def store_status(root: Path) -> dict[str, Any]:
 
 
 def _cell_status(folder: CellFolder, names: tuple[str, str], now: float) -> dict[str, Any]:
-    """Return the state of a cell.  names: the name of its sweep, and its name in that sweep."""
+    """Return the state of a cell.  names: the name of its sweep, and the name of the cell in that sweep."""
     spec: Any = {}
     with suppress(DataError):
         spec = read_json(folder.path / SPEC)

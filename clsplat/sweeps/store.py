@@ -543,9 +543,9 @@ class Store:
             os.utime(cancel_file)
 
     def is_cancelled(self, names: Sequence[str], since: float) -> bool:
-        """Return whether a request applies to cells with one of these names that started at `since`.
+        """Return whether a request to stop applies to cells with one of these names that started at `since`.
 
-        since: a time by the clock of `now`.
+        since: a time by the clock of the store.
         """
         for name in (ALL, *filter(None, names)):
             with suppress(OSError):

@@ -96,12 +96,12 @@ def _run_cell(
                 return _publish(store, folder, attempt)
             message = attempt.message(code)
         except LeaseLost:
-            if folder.verified_manifest():  # by another process, while this one was frozen
+            if folder.verified_manifest():  # published by another process while this one was frozen
                 continue
             raise
         except BitsMismatch:
             raise
-        except OutputError as error:  # while publishing; handled as a write error of the run
+        except OutputError as error:  # raised while publishing; handled as a write error of the run
             code, message = error.exit_code, one_line(error)
             attempt.end(code)
         if should_stop():

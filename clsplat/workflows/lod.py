@@ -35,7 +35,7 @@ class LodPlan:
 
     levels: int = 4
     keep: float = 0.5  # fraction of the Gaussians of the previous level
-    steps: int | None = None  # to train each level; 0: none; None: STEPS if there are photos
+    steps: int | None = None  # training steps per level; 0: no training; None: STEPS if there are photos
     downscale: float | None = None  # divisor of the image size in training; None: as the model was trained
 
     def __post_init__(self) -> None:

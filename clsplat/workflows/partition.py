@@ -35,7 +35,7 @@ class PartitionCell:
     """A region of space and the size of its content."""
 
     box: Box
-    size: Floats  # [3] scene units, between quantiles of its Gaussians
+    size: Floats  # [3] scene units: distances between the SIZE_QUANTILES of the Gaussians' positions
 
     def extended(self, fraction: float) -> Box:
         """Return the box extended on each side by half of `fraction` of the cell's size."""

@@ -20,8 +20,8 @@ from clsplat.formats.mesh import Floats, Mesh
 from clsplat.render.fusion import SIDE, DistanceField
 
 LOG = logging.getLogger("clsplat")
-MIN_VALUE = 2e-3  # of a distance, so that no vertex is at a grid point, where its edge would be unknown
-MIN_FRACTION = 1e-4  # of an edge, from its ends; smaller distances are rounding errors
+MIN_VALUE = 2e-3  # smallest absolute distance, so that no vertex is at a grid point, where its edge would be unknown
+MIN_FRACTION = 1e-4  # of an edge: a vertex closer to an end is at that end, except for rounding
 MIN_PART = 0.01  # of the faces of the largest part; smaller parts are removed
 TAUBIN, ROUNDS = (0.5, -0.53), 20  # Taubin 1995: factors of two steps that together do not shrink; number of rounds
 MORE_FACES = 1.5  # factor on the number of faces to keep, each time a reduction opens a closed surface

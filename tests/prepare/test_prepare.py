@@ -91,9 +91,9 @@ def test_plan_gives_reasons(photos, tmp_path):
     run_steps(steps, photos, root)
     assert [item.reason for item in plan(steps, photos, root)] == ["", ""]
     changed = plan([steps[0], Copy(letter="z")], photos, root)
-    assert [item.reason for item in changed] == ["", "letter is z, was b"]
+    assert [item.reason for item in changed] == ["", "letter changed from b to z"]
     (photos / "p.txt").write_text("P")
-    assert plan(steps, photos, root)[0].reason == "letter is a, was b"  # the newest of that step
+    assert plan(steps, photos, root)[0].reason == "letter changed from b to a"  # the newest of that step
     assert [item.reason for item in plan(steps[1:], photos, root)] == ["its input has changed"]
 
 
@@ -142,7 +142,7 @@ def test_damaged_result_is_redone(photos, tmp_path, fault, caplog):
     why = {"a file less": "x.txt is missing", "an empty file": "x.txt was changed", "a folder": "x.txt is missing"}
     why = f"{why.get(fault, 'record.json is missing or damaged')}; the result is recomputed"
     assert [item.reason for item in plan(steps, photos, root)] == ["", why]
-    assert plan([steps[0], Copy(letter="z")], photos, root)[1].reason.startswith("letter is z")
+    assert plan([steps[0], Copy(letter="z")], photos, root)[1].reason.startswith("letter changed")
     assert run_steps(steps, photos, root) == ("pab", ["b"])
     assert f"copy runs again: {why}" in caplog.messages
     assert run_steps(steps, photos, root) == ("pab", [])
@@ -173,7 +173,7 @@ def test_result_without_its_images_is_redone(photos, tmp_path):
     shutil.rmtree(plan(steps, photos, root)[0].folder)
     planned = plan(steps, photos, root)
     assert [item.reason for item in planned] == [
-        "letter is a, was b",
+        "letter changed from b to a",
         "images/p.txt is missing; the result is recomputed",
     ]
     assert (prepare(planned, photos, root) / "images" / "p.txt").read_text() == "p"

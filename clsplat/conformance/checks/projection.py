@@ -49,7 +49,7 @@ def check_record(device: Device, case: Case, label: str) -> Results:
     kernel = "project_forward"
     records, keys, radius = project_records(device, case)
     truth, (width, height) = case.project(), case.size
-    # the kernel also culls splats that reach no pixel of the image: they must be outside of it or too faint
+    # the kernel also culls splats that reach no pixel of the image: such splats must be outside the image or too faint
     is_rendered = records[:, 5] > 0
     x, y = truth.mean2d.T
     may_be_culled = (x < 0) | (y < 0) | (x > width) | (y > height) | (truth.opacity < 1.001 / 255)

@@ -266,7 +266,7 @@ def rows_of_tables(device: Device, rng: np.random.Generator) -> Results:
         yield Deviation("count_not_finite", f"tables with {value}", len(wrong_names), 0, counts=True)
 
 
-# Deferred updates of harmonics, which are done when their Gaussians are visible again.
+# Updates of harmonics that are deferred until their Gaussians are visible again.
 
 DEFERRED_COUNTS = (1, 15, 17, 65, 150)
 CULLED = 0xFFFFFFFF

@@ -254,12 +254,12 @@ def same_area(camera: Camera, size: Size) -> Camera:
 
 
 def fit_inside(camera: Camera, size: Size) -> Camera:
-    """Return a camera with another image size, whose image contains the entire original image at its center."""
+    """Return a camera of another image size that shows the entire original image at the center."""
     return center_inside(camera, size, fit_scale(camera, size))
 
 
 def center_inside(camera: Camera, size: Size, scale: float) -> Camera:
-    """Return a camera with another image size, whose image shows the original one at its center, scaled by `scale`."""
+    """Return a camera of another image size that shows the original image at the center, scaled by `scale`."""
     width, height = size
     left, top = (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
     return Camera(
