@@ -111,8 +111,7 @@ def map_cameras(
             if attempt.has_more_pairs and not (extra_pairs := expand_pairs(source / DATABASE, missing)):
                 continue
             if attempt is not first:
-                counts = registered_count, len(names)
-                LOG.info("registered %d of %d photos; trying again with %s", *counts, attempt.label)
+                LOG.info("registered %d of %d photos; retrying with %s", registered_count, len(names), attempt.label)
             count += 1
             candidates = _run_attempt(source, out, attempt, threads, models[:1], extra_pairs)
             if attempt.has_more_pairs:
@@ -130,8 +129,7 @@ def map_cameras(
         raise DataError(f"{source / IMAGES}: the {len(names)} photos could not be registered: {diagnose(graph)}")
     database, registered_names = best.database_path(source, out), _registered_names(models[0])
     if reason := explain_missing_depth(pycolmap, database, registered_names):
-        count_text = f"{len(registered_names)} of {len(names)}"
-        raise DataError(f"{source / IMAGES}: the {count_text} photos that were registered {reason}")
+        raise DataError(f"{source / IMAGES}: the {len(registered_names)} registered photos of {len(names)} {reason}")
     if best.is_dense:
         graph = MatchGraph.from_database(pycolmap, database, source / IMAGES)
     if min_track_length == TWO_VIEWS:
