@@ -32,7 +32,7 @@ class World:
     shapes: tuple[Shape, ...]
     camera_angle_x: float  # field of view, radians
     grid: int  # a pixel is the mean of grid x grid rays
-    canopy: tuple[Shape, ...] | None = None  # shapes that block skylight; None: all shapes
+    occluders: tuple[Shape, ...] | None = None  # shapes that block skylight; None: all shapes
 
     def trace(self, origins: Array, directions: Array) -> tuple[Array, NDArray[np.intp]]:
         """Return the distance to the closest shape (inf for a miss) and its index in `shapes`, both [R]."""
@@ -69,12 +69,12 @@ class World:
         to_key = normalize(align(KEY_DIRECTION, KEY_WIDTH * key_sample[0], KEY_WIDTH * key_sample[1], 1.0))
         key_light = np.isinf(self.trace(start, to_key)[0]) * np.maximum(dot(KEY_DIRECTION, normal), 0)
         to_sky = align(normal, sky_sample[0], sky_sample[1], np.sqrt(1 - dot(sky_sample, sky_sample)))
-        occluders = self if self.canopy is None else replace(self, shapes=self.canopy)
-        distance, blocker = occluders.trace(start, to_sky)
+        occluder_world = self if self.occluders is None else replace(self, shapes=self.occluders)
+        distance, blocker = occluder_world.trace(start, to_sky)
         light = SKY_LIGHT * (0.75 + 0.25 * normal[2])
         occluded = np.flatnonzero(np.isfinite(distance))
         blocking_points = start[:, occluded] + distance[occluded] * to_sky[:, occluded]
-        light[:, occluded] *= BOUNCE * occluders.by_shape(Shape.texture, blocker[occluded], blocking_points)
+        light[:, occluded] *= BOUNCE * occluder_world.by_shape(Shape.texture, blocker[occluded], blocking_points)
         return np.asarray(self.by_shape(Shape.texture, index, points) * (KEY_LIGHT * key_light + light))
 
     def camera_rays(self, pose: Array, size: int, x: Array, y: Array) -> tuple[Array, Array]:

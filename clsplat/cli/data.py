@@ -41,9 +41,9 @@ def photos(
     source: Annotated[Path, typer.Argument(help="Folder of photos; nothing is written to it.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scene; finished steps in it are not repeated.")],
     long_side: Annotated[int, typer.Option(min=64, help="Long side in px of the images for feature detection.")] = 1600,
-    camera_model: Annotated[CameraModel, typer.Option(help="Camera model of COLMAP.")] = "SIMPLE_RADIAL",
+    camera_model: Annotated[CameraModel, typer.Option(help="COLMAP camera model.")] = "SIMPLE_RADIAL",
     matching: Annotated[Matching, typer.Option(help="Which pairs of photos to match.")] = "auto",
-    mapper: Annotated[Mapper, typer.Option(help="Mapping method.")] = "incremental",
+    mapper: Annotated[Mapper, typer.Option(help="COLMAP mapper.")] = "incremental",
 ) -> None:
     """Find the cameras of photos by structure from motion, and write a COLMAP folder."""
     from clsplat.prepare.cache import place_photographs

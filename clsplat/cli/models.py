@@ -405,7 +405,7 @@ FromOption = Annotated[
     typer.Option("--from", metavar="X,Y,Z", help="One image from this position, or a video with a fixed camera."),
 ]
 TargetOption = Annotated[
-    str | None, typer.Option("--look-at", metavar="X,Y,Z", help="With --from: look here; default: the center.")
+    str | None, typer.Option("--look-at", metavar="X,Y,Z", help="With --from: point to look at; default: the center.")
 ]
 SideOption = Annotated[
     str | None,

@@ -120,7 +120,7 @@ def status(
         Path | None,
         typer.Argument(
             metavar="RUN|STORE",
-            help="The folder of a run, a matrix, or blocks, or a store of cells.",
+            help="The folder of a run, a matrix, or a scene in blocks, or a store of cells.",
             show_default=False,
         ),
     ] = None,
@@ -268,7 +268,7 @@ def blocks(
     ] = 0.05,
     steps: Annotated[
         Literal["each", "shared"],
-        typer.Option(help="Steps per block: as in the pipeline, or proportional to the number of views of the block."),
+        typer.Option(help="Steps of each block: all of them, or proportional to its number of views."),
     ] = "each",
     plan: Annotated[bool, typer.Option("--plan", help="Only train the coarse model and show the plan.")] = False,
     set_: SetOption = None,

@@ -137,7 +137,7 @@ def one_line(error: BaseException | str) -> str:
 
 
 def first_few(names: Sequence[str]) -> str:
-    """Join up to MAX_NAMES names of a list for a message, and append how many more there are."""
+    """Join the first MAX_NAMES names for a message, and append the number of the remaining names."""
     more = f", and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
     return ", ".join(names[:MAX_NAMES]) + more
 
@@ -154,7 +154,7 @@ def size_text(gaussians: int | None, parameters: int | None, sky: int = 0) -> st
 
 
 def shell_quote(path: object) -> str:
-    """Quote a path for the shell, for a command in a message."""
+    """Quote a path for a shell command in a message."""
     return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))
 
 

@@ -69,15 +69,15 @@ def new_folder(folder: Path) -> Iterator[Path]:
     """Yield a hidden folder next to `folder`, and rename it to `folder` when the block ends without an error.
 
     Hidden folders left by killed processes are removed first.  The caller must sync the files.
-    Raises ConfigError when `folder` exists and is not empty, and OutputError, possibly before the block, when it cannot
-    be created.
+    Raises ConfigError if `folder` exists and is not empty.  Raises OutputError, possibly before the block, if the
+    folder cannot be created.
     """
     require_free(folder)
     with scratch_folder(folder) as temporary:
         yield temporary
         with raising_output_error(folder):
             if folder.exists():
-                folder.rmdir()  # empty; Windows cannot replace a folder
+                folder.rmdir()  # it is empty; os.replace cannot replace a folder on Windows
             _replace(temporary, folder)
             sync_folder(folder.parent)
 
@@ -155,7 +155,7 @@ def append(path: Path, data: bytes) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents, and sync their names, so that they survive a power failure.  Raises OSError."""
+    """Create a folder and its parents, and sync their directory entries to disk.  Raises OSError."""
     new_folders = list(itertools.takewhile(lambda path: not path.exists(), (folder, *folder.parents)))
     folder.mkdir(parents=True, exist_ok=True)
     for path in new_folders:
@@ -163,7 +163,7 @@ def make_folder(folder: Path) -> None:
 
 
 def sync_below(folder: Path) -> None:
-    """Wait until all files below a folder and their names are on disk; links are not followed.  Raises OSError."""
+    """Sync all files below a folder, and their directory entries, to disk.  Links are skipped.  Raises OSError."""
     for base, _, names in os.walk(folder):
         for path in (Path(base, name) for name in names):
             if path.is_file() and not path.is_symlink():
@@ -172,8 +172,8 @@ def sync_below(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on disk, if the system supports that.  Raises OSError."""
-    if hasattr(os, "O_DIRECTORY"):  # Windows writes names with the file
+    """Sync the directory entries of a folder to disk, if the system supports that.  Raises OSError."""
+    if hasattr(os, "O_DIRECTORY"):  # Windows syncs a directory entry with its file
         _sync(folder, os.O_RDONLY | os.O_DIRECTORY)
 
 
@@ -262,7 +262,7 @@ EARLY_RUN_FILES = frozenset({STATUS, LOG_FILE, LOCK, UNDISTORTED})  # written be
 RUN_FILES = EARLY_RUN_FILES | {PIPELINE, METRICS, RECORDS, TRIAL, PREPARE_SUMMARY, INPUTS, CHECKSUMS, CHECKPOINTS}
 MATRIX_FILES = frozenset({STATUS, LOCK, PIPELINE, COMPARISON, STORE})
 END_STATES = ("done", "failed", "interrupted")  # states in status.json
-HEARTBEAT_TIMEOUT = 60  # seconds without a heartbeat in status.json after which a run may have ended
+HEARTBEAT_TIMEOUT = 60  # seconds; a run may have ended if its heartbeat in status.json is older
 MAX_NAME_BYTES = 200  # systems allow 255, and temporary names are longer
 _WINDOWS_NAMES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # devices
 

@@ -75,7 +75,7 @@ def _write_fault(folder: Path) -> str:
 
 
 def space_fault(folder: Path) -> str:
-    """Return why built kernels may not fit in a folder, or '' if they do."""
+    """Return the reason why built kernels may not fit in a folder, or '' if they fit."""
     with suppress(OSError, AttributeError):  # the free space is unknown
         if (free := shutil.disk_usage(folder).free) < MIN_SPACE:
             return f"{folder}: has only {free >> 10} KiB of free space, too little for built kernels"
@@ -224,7 +224,7 @@ def _boot_id() -> str | None:
 def is_alive(pid: int) -> bool:
     """Return whether a process of this machine is running; True if unknown.
 
-    After a process exits, a newer one may have its ID.
+    A new process may have the ID of a process that has exited.
     """
     if sys.platform == "win32":  # os.kill(pid, 0) would end the process there
         return _is_alive_on_windows(ctypes.WinDLL("kernel32", use_last_error=True), pid)

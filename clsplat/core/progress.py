@@ -105,7 +105,7 @@ class ItemCounter:
         return (time.monotonic() - start) / (self.done - start_count) * (self.total - self.done)
 
     def reach(self, done: int) -> None:
-        """Record and report how many items are done; a count of 0 items is not reported."""
+        """Record the number of finished items, and report it unless the total is 0."""
         self.done = done
         if not self.total:
             return

@@ -54,7 +54,7 @@ class Curve(Settings):
     @property
     @abstractmethod
     def values(self) -> list[float]:
-        """Values of the curve, including the smallest and the largest, to check against bounds."""
+        """The values of the curve, including the smallest and the largest, for checks against bounds."""
 
     def divide(self, factor: float) -> "Curve":
         """Return the curve with its values divided by a factor.  Raises ConfigError if the curve does not allow it."""

@@ -1,4 +1,4 @@
-"""Define settings: frozen models whose fields are the keys of a pipeline file, and the named variants of a key.
+"""Define settings, which are frozen pydantic models whose fields are the keys of a pipeline file, and their variants.
 
 A variant is a subclass with a name, which is the `Literal` of its field `type`, or `stage` for stages.  A pipeline file
 can use a variant as soon as its class is defined, in the package or in a plug-in.  There is no other list of variants.
@@ -58,7 +58,7 @@ class Settings(BaseModel):
         Settings.subclasses.append(cls)
 
     def conflict_names(self) -> set[str]:
-        """Return the names by which `conflicts` of other settings may refer to this one."""
+        """Return the names by which `conflicts` of other settings may refer to these settings."""
         return {self.family, *(str(getattr(self, tag)) for tag in TAGS if tag in type(self).model_fields)}
 
     def active_conflicts(self) -> Mapping[str, str]:
@@ -131,7 +131,7 @@ def variant_tag(cls: type[Settings]) -> tuple[str, str] | None:
 
 
 def resume_effect(cls: type[Settings], key: str) -> Literal["output", "training"] | None:
-    """Return what a change of a key's value on resume affects, or None if the value may not change."""
+    """Return what changes if the value of a key differs on resume, or None if the value may not differ."""
     bases = [base for base in cls.__mro__ if issubclass(base, Settings)]
     if any(key in base.output_keys for base in bases):
         return "output"

@@ -23,7 +23,7 @@ class _Received:
 
     def __init__(self) -> None:
         self.blocks = 0
-        self.number = 0  # of the last signal; 0: none
+        self.number = 0  # number of the last signal; 0: none
         self.since = 0.0  # time of the first signal
 
     def record(self, number: int) -> None:
@@ -69,7 +69,7 @@ def _watch_stdin() -> None:
 
 
 def _handlers() -> dict[int, Any]:
-    """Return signals and their handlers, except ignored ones: SIGHUP stays ignored under nohup."""
+    """Return the handlers of all signals that are not ignored, by number.  Under nohup, SIGHUP stays ignored."""
     signal_numbers = [getattr(signal, name) for name in NAMES if hasattr(signal, name)]
     handlers = {number: signal.getsignal(number) for number in signal_numbers}
     return {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}

@@ -113,7 +113,7 @@ class Moving(SyntheticOptions):
 
     def world_at(self, time_index: int) -> World:
         """Return the scene at a timestamp."""
-        return World(shapes_at(self.time(time_index)), camera_angle_x=0.69, grid=3, canopy=STATIC_SHAPES)
+        return World(shapes_at(self.time(time_index)), camera_angle_x=0.69, grid=3, occluders=STATIC_SHAPES)
 
     def poses(self) -> dict[str, list[Array]]:
         """Return the camera-to-world matrices of each split; test cameras are between training cameras."""
