@@ -1,6 +1,6 @@
 """Render painted convex shapes with exact cameras, by ray casting.
 
-    primary ray -> closest shape -> paint x (key light x shadow + sky x openness) -> mean of the pixel's samples
+    primary ray -> closest shape -> paint x (key light x shadow + sky x visible sky) -> mean over the pixel's samples
 
 The z axis points up.  Colors are linear until `photograph` encodes them.  Points and directions are [3, R], as in
 shapes.py.
@@ -17,7 +17,7 @@ from .shapes import Array, Shape, align, disc, dot, normalize, rotate
 BLOCK = 65536  # rays per block: smaller blocks need more calls, larger blocks more memory
 SURFACE_OFFSET = 1e-6  # scene units: secondary rays start this far above the surface
 
-# Light: one jittered shadow ray and one sky ray per sample; a pixel's grid x grid samples share the work.
+# Light: each sample casts one jittered shadow ray and one sky ray; the mean of a pixel's samples reduces the noise.
 KEY_DIRECTION = normalize(np.array([[0.45], [-0.62], [0.95]]))
 KEY_LIGHT = np.array([[1.0], [0.95], [0.86]])
 KEY_WIDTH = 0.11  # radius of the key light, as a fraction of its distance

@@ -19,9 +19,9 @@ from clsplat.core.reading import sha256
 
 CHUNK = 1 << 20  # bytes
 MAX_TRIES = 5  # per download
-PAUSE = 1.0  # s between tries
-TIMEOUT = 30  # s without a byte
-PIP_TIMEOUT = 3600  # s
+PAUSE = 1.0  # seconds between tries
+TIMEOUT = 30  # seconds without data
+PIP_TIMEOUT = 3600  # seconds
 MAX_UNPACKED_SIZE = 200 << 30  # bytes that an archive may unpack to
 Report = Callable[[str], None]
 

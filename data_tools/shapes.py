@@ -124,7 +124,8 @@ class Shape:
         """Return the distance along each ray to the surface of the shape, [R], or inf for a miss."""
         offset = origins - np.array(self.center)[:, None]
         along, square = dot(offset, directions), dot(offset, offset) - self.bounding_radius**2
-        near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))  # through the bounding sphere
+        # rays that hit the bounding sphere
+        near = np.flatnonzero((square < along * along) & ((along < 0) | (square < 0)))
         distance = np.full(along.shape, np.inf)
         offset, directions = (np.broadcast_to(v, (3, len(along)))[:, near] for v in (offset, directions))
         enter, leave = self.interval(rotate(self.axes, offset), rotate(self.axes, directions))

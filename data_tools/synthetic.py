@@ -153,7 +153,9 @@ def write_transforms(path: Path, world: World, frames: list[dict[str, Any]]) -> 
 def surface_points(
     world: World, pose: Array, image: NDArray[np.uint8], count: int, noise: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return positions and colors of noisy surface points in a view, both [M, 3], like points of structure from motion.
+    """Return the positions and colors, both [M, 3], of noisy points on the surfaces in a view.
+
+    The points imitate those of structure from motion.
 
     count: number of rays through opaque pixels; M is smaller if rays miss
     noise: standard deviation of each coordinate, scene units

@@ -33,8 +33,8 @@ def write_frames(video: Path, out: Path, frames: int = 100, long_side: int | Non
     long_side: the maximum width and height of the images, px
     times: whether to also write times.json with the index of each frame in the video, for a dynamic scene
 
-    The format is PNG because a second lossy compression changes features and colors.  An interrupted call can be
-    repeated; it keeps the frames that were extracted from the same video with the same settings.
+    The format is PNG because a second lossy compression would change features and colors.  An interrupted call can be
+    repeated: it keeps the frames that were extracted from the same video with the same settings.
 
     Raises DataError if the video cannot be decoded or has only one frame, or if `out` contains other images.
     """

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from clsplat.api.arguments import Overrides, PathLike, load_plugins, overrides, to_path
 from clsplat.core.errors import ConfigError
 
-if TYPE_CHECKING:  # the command line starts without OpenCL
+if TYPE_CHECKING:  # the command line must start without importing OpenCL
     from clsplat.opencl.device import Device
     from clsplat.runs.run_folder import Start
     from clsplat.sweeps.experiment import Job
@@ -248,7 +248,7 @@ def compress_model(
     steps: int | None = None,
     device: "str | Device | None" = None,
 ) -> dict[str, Any]:
-    """Find the smallest file of a model within a limit on quality loss, or the best file within a limit on size.
+    """Compress a model to the smallest file within a limit on quality loss, or the best file within a limit on size.
 
     model, scene: as for `render_views`
     target: the limit, such as "-0.1dB" (of PSNR) or "5MB"
@@ -364,11 +364,11 @@ def train_in_blocks(
     """Train a scene in blocks: partition a coarse model, train each block with the views that see it, and merge them.
 
     scene: the dataset folder
-    out: folder of all runs; an interrupted call continues there
+    out: folder for all runs; to continue an interrupted call, repeat it with the same folder
     pipeline: the pipeline that trains each block
     blocks: the number of blocks
     coarse: a pipeline that trains the coarse model, or a model file or run folder
-    min_coverage: a view belongs to a block that covers more than this fraction of its pixels
+    min_coverage: a block trains on a view if it covers more than this fraction of the view's pixels
     steps: "each" trains every block for all steps of the pipeline; "shared" trains a block for a fraction of the steps,
         in proportion to its number of views
     overrides, coarse_overrides: settings of the two pipelines, as 'stage.key=value'

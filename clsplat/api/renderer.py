@@ -82,7 +82,7 @@ class RenderResult:
     median_depth: Floats | None  # [height, width] scene units, where transmittance falls below ½; 0 if it stays above
     view: View
     background: Floats  # [3]
-    model: DeviceModel  # the rendered model, which stays on the device as long as this result
+    model: DeviceModel  # the rendered model, which stays on the device as long as this result exists
     renderer: "Renderer"
 
     def backward(

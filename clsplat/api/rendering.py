@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from clsplat.api.arguments import PathLike, layer_names, load_plugins, to_path
 from clsplat.core.errors import ConfigError
 
-if TYPE_CHECKING:  # the command line starts without OpenCL
+if TYPE_CHECKING:  # the command line must start without importing OpenCL
     import numpy as np
     from numpy.typing import NDArray
 
@@ -97,7 +97,7 @@ def render_path(
     times: for a dynamic model, one time in [0, 1], or the times of the first and last frame, such as (0, 1) or "0..1";
         default: the full range, or the times of the views
     position, look_at: for the path `fixed`, the world coordinates, [3], of the camera and of the point to look at,
-        by default the focus of the scene
+        by default the point nearest to the viewing axes of the cameras
     side: what the right half shows: "photograph" for the photo of the nearest camera, or the path of another model
     depth, normals, alpha: also write videos of these layers, as in `render_views`
 

@@ -8,7 +8,7 @@ from clsplat.api.arguments import PathLike, load_plugins, to_path
 from clsplat.opencl.runtimes import no_device_advice as no_device_advice
 from clsplat.opencl.runtimes import no_device_error as no_device_error
 
-if TYPE_CHECKING:  # the command line starts without OpenCL
+if TYPE_CHECKING:  # the command line must start without importing OpenCL
     from clsplat.conformance.bench.measurement import Measurement
     from clsplat.conformance.doctor import DeviceReport
     from clsplat.opencl.device import Device

@@ -194,14 +194,14 @@ class Trainer:
     @property
     @serialized
     def model(self) -> Model:
-        """A copy of the current model.  `model.baked()` bakes in the 3D filter, as for the files of a run."""
+        """A copy of the current model.  `model.baked()` bakes in the 3D filter, as in the files of a run."""
         return host_model(self._run)
 
     @serialized
     def add_loss(self, function: HostFunction, weight: Schedule = 1.0) -> None:
         """Add a loss in NumPy: `function(image, photograph) -> (value, gradient with respect to the image)`.
 
-        function: receives and returns arrays [height, width, 3] float32; images are in [0, 1]
+        function: all its arrays are [height, width, 3] float32; the two images have values in [0, 1]
         weight: a number or a schedule
 
         Each step copies both images to the host and the gradient back; a plug-in with a kernel avoids these copies.

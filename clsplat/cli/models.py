@@ -122,11 +122,11 @@ def view(
 
 CropOption = Annotated[
     str | None,
-    typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep this box, in world coordinates after --transform."),
+    typer.Option(metavar="X0,Y0,Z0,X1,Y1,Z1", help="Keep only this box, in world coordinates after --transform."),
 ]
 TransformOption = Annotated[
     str | None,
-    typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z translate=X,Y,Z, or a matrix; also rotates SH."),
+    typer.Option(metavar="TEXT", help="scale=S rotate=X,Y,Z (degrees) translate=X,Y,Z, or a matrix; also rotates SH."),
 ]
 MergeOption = Annotated[
     int | None, typer.Option(metavar="N", min=1, help="Merge neighbors until N Gaussians remain, excluding the sky.")
