@@ -57,7 +57,7 @@ WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_READS = 8  # largest average number of reads per byte; equal columns may share an accessor
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
 LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # converts between these axes and those of a PLY
-MAX_NAME = 500  # characters of a file name, and of a data URI before its data
+MAX_NAME = 500  # characters, longest file name, and longest start of a data URI
 MAX_TEXT = 1 << 29  # bytes of a .gltf
 
 

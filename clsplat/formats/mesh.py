@@ -121,7 +121,7 @@ def read_collider(path: Path) -> tuple[Floats, NDArray[np.int64]]:
     """
     read = {".ply": _read_ply, ".obj": _read_obj}.get(path.suffix.lower())
     if read is None:
-        raise ConfigError(f"--collider {path}: expected a mesh as .ply or .obj, as `clsplat mesh --collision` writes")
+        raise ConfigError(f"--collider {path}: expected a .ply or .obj mesh, such as one of `clsplat mesh --collision`")
     try:
         vertices, faces = read(path)
     except (ValueError, IndexError) as error:

@@ -25,7 +25,7 @@ _SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00
 def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return the index of each unit quaternion's largest component, [N], and its other three components, [N, 3].
 
-    The largest component has the largest magnitude; a quaternion is negated if this component is negative.
+    The largest component is the one with the largest magnitude.  If it is negative, the quaternion is negated.
     """
     largest_index = np.argmax(np.abs(quats), axis=1)
     rows = np.arange(len(quats))

@@ -147,7 +147,7 @@ MIN_LIMIT = 1 << 19  # splats that a file of any size may have: 0.1 GB in memory
 PER_ROW = 64  # centroids
 MAX_PALETTE = 1 << 16  # centroids, as labels have 16 bits
 WIDTHS = {3: 1, 8: 2, 15: 3}  # SH degree by number of coefficients of a centroid
-MAX_NUMBER = 1e30  # of the absolute values in meta.json
+MAX_NUMBER = 1e30  # largest absolute value in meta.json
 LARGEST_W = 252  # alpha of a quaternion whose largest component is w; 253 to 255 for x, y, z
 
 
@@ -268,7 +268,7 @@ class _Sog:
         return (minimum + levels / 255.0 * (maximum - minimum)).astype(np.float32)
 
     def _read_pixels(self, name: str, index: int) -> NDArray[np.uint8]:
-        """Return the pixels of an image of a property, such as `means`, one pixel per splat, [count, 4]."""
+        """Return the pixels of one image of a property, such as `means`: one pixel per splat, [count, 4]."""
         images = self.images[name]
         if index >= len(images):
             raise DataError(

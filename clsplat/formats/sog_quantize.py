@@ -17,8 +17,8 @@ from clsplat.formats.palette import robust_max
 from clsplat.formats.splats import MAX_LOG, SH_C0, Parameters, normalize_quats
 
 Floats = NDArray[np.floating]
-LEVELS = 65535  # of a coordinate
-TINY = 2.0**-40  # levels, replaces a size of 0
+LEVELS = 65535  # largest level of a coordinate
+TINY = 2.0**-40  # levels; replaces a size of 0
 MAX_ZERO_BITS = 8  # last bits of a position that may be zeroed
 _SIGNED = [quat for quat in product((0, 1, -1), repeat=4) if np.count_nonzero(quat) in (1, 2, 4)]
 # quaternions of the rotations that map axes onto axes, [24, 4]; q and -q are the same rotation
@@ -163,7 +163,7 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
 
 # Compute a large SH palette by splitting clusters of Gaussians recursively.
 
-LLOYD_STEPS = 3  # per split
+LLOYD_STEPS = 3  # iterations per split
 SPLIT_FRACTION = 0.5  # largest fraction of clusters split before errors are recomputed
 TINY_WEIGHT = 1e-300  # replaces the weight of an empty cluster
 SH_LEVELS = 128  # levels in a coefficient of 1
@@ -259,7 +259,7 @@ def _label_sums(
 
 # Estimate how much each Gaussian contributes to renders, from the model alone.
 
-MAX_LOG_WEIGHT = 10.0  # limit of the absolute logarithms
+MAX_LOG_WEIGHT = 10.0  # largest absolute value of the logarithms
 # Sky Gaussians are recognized by a gap in distance: clsplat/gaussians/conversion.py places them 10 times as far away as
 # 97 % of the scene.  Their row numbers do not help, because models are cropped, decimated, sorted, and rounded later.
 GAP, INSIDE = 5.0, 0.97

@@ -28,10 +28,10 @@ from clsplat.core.quaternions import multiply, unit_quaternions
 
 MOTION = "motion"
 FIELDS = {"velocity": 3, "time_center": 1, "log_duration": 1, "acceleration": 3, "jerk": 3, "turn": 4}
-TURN = 4  # columns of the change of the quaternion
+TURN = 4  # columns of the time derivative of the quaternion
 MAX_DEGREE = 3
 EXPECTED_TIME = "expected a timestamp from 0, the start of the scene, to 1, its end"
-STATIC_LOG_DURATION = 12.0  # of a Gaussian that is always visible: exp(-1/2 exp(-24)) is 1 in float32
+STATIC_LOG_DURATION = 12.0  # log duration of a Gaussian that is always visible: exp(-1/2 exp(-24)) is 1 in float32
 
 
 def is_timestamp(time: float) -> bool:
@@ -79,20 +79,20 @@ MAX_STORED_DEGREE = 4  # largest SH degree in files; bands beyond MAX_DEGREE are
 SH_C0 = 0.28209479177387814  # basis function of band 0
 VARIANCE = 0.3  # px²: screen filter of 3DGS
 NEAR_FRACTION = 0.04  # default near plane, relative to the median distance of the means from their center
-MIP_VARIANCE = 0.1  # px², of files that only say `mip` (Yu et al. 2024)
+MIP_VARIANCE = 0.1  # px²: screen filter of files that only say `mip` (Yu et al. 2024)
 MAX_FILE = 1 << 33  # bytes
-MAX_VALUE = 1e15  # of the tables in BOUNDED; viewers and codebooks fail beyond it
+MAX_VALUE = 1e15  # largest absolute value in the tables of BOUNDED; viewers and codebooks fail beyond it
 BOUNDED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
 # fraction of out-of-range values above which another unit is assumed; mirrored axes also have negative scales
 MIN_OUTSIDE = 0.5
-MAX_EXPONENT = 700.0  # of exp in float64
-MAX_LOG = 88.7  # of a scale in float32; exp overflows beyond it
+MAX_EXPONENT = 700.0  # largest argument of exp in float64
+MAX_LOG = 88.7  # largest log scale in float32; exp overflows beyond it
 FLAT_LOG_SCALE = -13.815511  # log 1e-6: for the third axis of a 2DGS disc
 FLATNESS = -6.907755  # log 1e-3: largest ratio of that axis to the others
-# axes in which the functions of bands 1 to 3 are odd
+# for each basis function of bands 1 to 3, the axes along which it is odd
 PARITY = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
-FLIP = (1.0, -1.0, -1.0)  # between y down, z forward, and y up, z back
+FLIP = (1.0, -1.0, -1.0)  # converts between y down, z forward and y up, z back
 FLIP_4 = np.diag([*FLIP, 1.0])  # the same for matrices, [4, 4]
 Quality = Literal["small", "balanced", "high"]  # precision of SPZ and SOG
 Parameters = dict[str, NDArray[np.float32]]  # by the names in PARAMETERS, each [N, components]
@@ -131,7 +131,7 @@ class SplatFile:
 class ReadOptions:
     """Options for reading a model."""
 
-    not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # Gaussians with NaN or infinity
+    not_finite: Literal["refuse", "drop", "keep"] = "refuse"  # what to do with Gaussians that contain NaN or infinity
     quiet: bool = False  # do not log about the axes of an SPZ file
 
 
@@ -139,7 +139,7 @@ class ReadOptions:
 class WriteOptions:
     """Options for writing a model."""
 
-    quality: Quality = "balanced"  # SPZ and SOG
+    quality: Quality = "balanced"  # for SPZ and SOG
     quiet: bool = False  # do not warn about what the format does not store
     world: bool = False  # positions in world coordinates, instead of an origin
     collider: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None  # OpenUSD: world vertices, [V, 3]; faces

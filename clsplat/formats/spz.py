@@ -98,7 +98,7 @@ class SpzHeader:
     version: int
     count: int
     degree: int
-    fraction: int  # bits
+    fraction: int  # fractional bits of positions
     flags: int
 
     @classmethod
@@ -175,7 +175,7 @@ def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) 
     Raises DataError if positions do not fit even without fractional bits.
     """
     max_value = float(np.abs(means).max(initial=0))
-    extra_bits = max(0, round(-math.log2(typical_size(means))) - COARSE)  # for models in a large unit of length
+    extra_bits = max(0, round(-math.log2(typical_size(means))) - COARSE)  # for models with a large unit of length
     target_bits = min((FINE_FRACTION if is_fine else FRACTION) + extra_bits, MAX_FRACTION)
     bits = min(target_bits, math.floor(math.log2(MAX_INT24 / max(max_value, 1e-9))))
     if bits < 0:
@@ -316,7 +316,7 @@ def _open_zstd(data: bytes) -> tuple[Any, type[Exception]]:
 
 WRITTEN_VERSION = 3  # more programs read it than version 4
 HEADER4 = 32  # bytes, in version 4
-LEVEL = 12  # of deflate
+LEVEL = 12  # compression level of deflate
 DEFLATE_RATIO = 1032  # largest compression ratio of deflate
 MAX_RATIO = 32  # largest accepted compression ratio; real files have less than 8
 MIN_LIMIT = 1 << 26  # bytes of planes that a file of any size may decompress to: 0.3 GB in memory
@@ -339,7 +339,7 @@ def read_spz(path: Path, options: ReadOptions) -> SplatFile:
 
 
 def decode_spz(path: Path, data: bytes) -> tuple[SplatFile, str]:
-    """Decode an SPZ file; return the splats and the declared axes ('' if none).  Raises the errors of `read_spz`."""
+    """Decode an SPZ file; return the splats and the declared axes ('' if none).  Raises errors like `read_spz`."""
     is_version_4 = data[:4] == MAGIC and SpzHeader.parse(path, data).version == 4
     header, parameters, axes = (_decode_version_4 if is_version_4 else _decode_gzip)(path, data)
     warn_dropped(path, header.degree)
@@ -381,7 +381,7 @@ def _decode_gzip(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, str]:
     stream = io.BytesIO(data) if data[:4] == MAGIC else _GzipReader(path, data)
     start = stream.read(HEADER)
     if start[:3] == b"ply":
-        require_content(path, data)  # says that it is compressed
+        require_content(path, data)  # reports that the PLY is compressed
     header = SpzHeader.parse(path, start)
     if header.version > 3:
         raise DataError(f"{path}: SPZ version 4 must use Zstandard, not gzip; export it again")

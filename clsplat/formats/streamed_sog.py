@@ -2,7 +2,7 @@
 
     lod-meta.json   version 1, count of all levels, counts by level, lodLevels, filenames, tree, and an environment
     a node          bound {min, max}, and two children; a leaf has lods: file, offset, and count for each level
-    L_i/meta.json   a SOG folder of level L, with the splats of one leaf after another; level 0 is the finest
+    L_i/meta.json   a SOG folder of level L, with the splats sorted by leaf; level 0 is the finest
 
 A viewer chooses the level of each leaf by its distance.  Reading returns the finest level.
 """
@@ -34,9 +34,9 @@ from clsplat.formats.splats import (
 )
 
 LOD_META = "lod-meta.json"
-MAX_LEVELS = 64  # programs write about ten
+MAX_LEVELS = 64  # programs write about ten levels
 RowRange = tuple[int, int]  # offset and count of a leaf's splats in a file
-RangesByFile = dict[int, list[RowRange]]  # of one level, ascending, by file number
+RangesByFile = dict[int, list[RowRange]]  # row ranges of one level, ascending, by file number
 
 
 def looks_like_lod(data: bytes) -> bool:
@@ -113,7 +113,7 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 
 def _check_name(path: Path, name: Any) -> str:
-    """Return `name` if it is that of a meta.json in a subfolder.  Raises DataError otherwise."""
+    """Return `name` if it is the path of a meta.json in a subfolder.  Raises DataError otherwise."""
     if not isinstance(name, str) or not _is_meta_below(name):
         raise DataError(f"{path}: names {quote(name)}; expected a {META} in a subfolder; export it again")
     return name

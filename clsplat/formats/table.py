@@ -59,7 +59,7 @@ class Codec:
     """One file format."""
 
     name: str
-    endings: tuple[str, ...]  # of file names
+    endings: tuple[str, ...]  # endings of file names
     matches: Callable[[FileStart], bool]
     read: Callable[[Path, ReadOptions], SplatFile] | None = None
     write: Callable[[Path, SplatFile, WriteOptions], str] | None = None  # returns the SHA-256
@@ -274,7 +274,7 @@ def write(path: Path, splats: SplatFile, options: WriteOptions | None = None) ->
 
 
 def warn_about_losses(path: Path, splats: SplatFile) -> None:
-    """Warn if the format of a file name cannot store the mark of a mip model, the rendering settings, or the origin."""
+    """Warn if the format of a file name cannot mark a mip model, or store the rendering settings or the origin."""
     codec = writing_format(path)
     if not codec.is_model:
         return

@@ -46,7 +46,7 @@ LOG = logging.getLogger("clsplat")
 
 BLOCK = 4096  # rows formatted at once
 EXTENT = 3.0  # standard deviations around the means
-LAYER = "scene.usda"  # in a .usdz
+LAYER = "scene.usda"  # file name in a .usdz
 PADDING = struct.pack("<2H20x", 0x1986, 20)  # aligns the data of LAYER to 64 bytes, as .usdz requires
 MAX_LAYER = 0x7FFFFFFF  # bytes; other programs do not read a ZIP64
 STAGE = """#usda 1.0
@@ -147,7 +147,7 @@ TOKEN = re.compile(
     re.DOTALL,
 )
 NO_PUNCTUATION = bytes.maketrans(b"()[],", b"     ")
-Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # to y up
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # converts z up to y up
 Prim = dict[bytes, bytes]  # the attributes of a prim, and its type as b"def"
 
 
@@ -179,7 +179,7 @@ def read_usd(path: Path) -> SplatFile:
 
 
 def _read_layer(path: Path) -> bytes:
-    """Return the text of a layer, which in a package is the first file."""
+    """Return the text of a layer; in a package, it is the first file."""
     data = read_file(path, "a .usda or .usdz file", limit=MAX_FILE)
     if data.startswith(b"PK"):
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -198,7 +198,7 @@ def _parse(text: bytes) -> tuple[Prim, list[tuple[Prim, Sequence[Prim]]]]:
     stack: list[Prim] = [{}]
     prims: list[tuple[Prim, Sequence[Prim]]] = []
     following: Prim = {}
-    depth = 0  # of parentheses, which enclose metadata
+    depth = 0  # number of open parentheses, which enclose metadata
     for match in TOKEN.finditer(text):
         token = match[0]
         if match["def"]:
@@ -223,7 +223,7 @@ def _read_parameters(path: Path, prim: Prim, notes: set[str]) -> Parameters:
     """Return the Gaussians of a prim in the axes of a PLY."""
 
     def table(name: str, width: int) -> NDArray[np.float32]:
-        value = prim.get(name.encode(), prim.get(f"{name}h".encode()))  # 16-bit floats
+        value = prim.get(name.encode(), prim.get(f"{name}h".encode()))  # names of 16-bit floats end in h
         if value is None:
             raise DataError(f"{path}: its Gaussians have no {name}; export the file again, without time samples")
         return _numbers(value).reshape(-1, width).astype(np.float32)
@@ -246,7 +246,7 @@ def _read_parameters(path: Path, prim: Prim, notes: set[str]) -> Parameters:
 
 
 def _numbers(value: bytes) -> NDArray[np.float64]:
-    """Return the numbers of a value.  Raises DeprecationWarning, by which NumPy reports other text."""
+    """Return the numbers of a value.  Raises DeprecationWarning, like NumPy, for other text."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)
         return np.fromstring(value.translate(NO_PUNCTUATION).decode("ascii"), sep=" ")

@@ -67,7 +67,7 @@ class PruneRedundant(Rule):
     error_rise: Positive = 0.01
     """Largest relative increase of the squared error: 0.01 is 0.04 dB."""
     views: Annotated[int, Field(ge=1)] = 10
-    """Number of training views on which the error is measured, sampled by seed and step; all if there are fewer."""
+    """Number of training views on which the error is measured, sampled at random; all if there are fewer."""
 
     def mark(self, edit: Edit) -> None:
         survey, gaussians = edit.survey, edit.gaussians

@@ -21,7 +21,7 @@ class WrongPixels:
     """The wrong pixels that each Gaussian contributes to."""
 
     pixels: NDArray[np.int64]  # [N] mean number per view, rounded down
-    score: Floats  # [N] number times the loss of the view, summed over views, scaled to [0, 1]
+    score: Floats  # [N] number per view times the view's loss, summed over views, scaled to [0, 1]
 
 
 def count_wrong_pixels(survey: Survey, views: int, error_above: float) -> WrongPixels:
@@ -43,7 +43,7 @@ class WrongPixelsRule(Rule):
     training_keys: ClassVar[frozenset[str]] = frozenset({"views", "error_above"})
 
     views: Annotated[int, Field(ge=1)] = 10
-    """Number of training views, sampled by seed and step; all if there are fewer."""
+    """Number of training views, sampled at random by seed and step; all if there are fewer."""
     error_above: UnitInterval = 0.1
     """Error above which a pixel is wrong: mean over channels, scaled to [0, 1] in each view."""
 
@@ -66,7 +66,7 @@ class RevertGrowth(WrongPixelsRule):
 
 
 class PruneSampled(SampledPruning, WrongPixelsRule):
-    """Remove a fraction of the faint and of the large Gaussians, sampled by 1 / (1 - score).
+    """Remove a fraction of the faint and of the large Gaussians, sampled with weights 1 / (1 - score).
 
     The score is the number of wrong pixels times the loss of the view, summed over views and scaled to [0, 1].
     """

@@ -41,7 +41,8 @@ def edge_scores(survey: Survey, views: int) -> Floats:
 class SplitLongAxis(Rule):
     """Replace a Gaussian with two Gaussians along its longest axis.
 
-    If the edit has a limit (`max_gaussians`, `budget`, memory), Gaussians are sampled by their edge-aware score.
+    If the edit has a limit (`max_gaussians`, `budget`, memory), Gaussians are sampled with their edge-aware
+    scores as weights.
     """
 
     type: Literal["split_long_axis"] = "split_long_axis"
@@ -52,7 +53,7 @@ class SplitLongAxis(Rule):
     gradient_above: Positive = 3.0e-4
     """Smallest mean of `screen_grad_abs` at which a Gaussian is split."""
     views: Annotated[int, Field(ge=1)] = 10
-    """Number of training views for the score, sampled by seed and step; all if there are fewer."""
+    """Number of training views for the score, sampled at random by seed and step; all if there are fewer."""
     distance: Positive = 1.35
     """Offset of each child, in standard deviations of the parent along its longest axis (published: 0.45 · 3)."""
     opacity: Annotated[float, Field(gt=0, le=1)] = 0.6

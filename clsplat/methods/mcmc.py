@@ -13,12 +13,12 @@ from clsplat.gaussians.gaussians import Gaussians
 from clsplat.training.run import Run
 from clsplat.training.stage import Scheduled
 
-MAX_COPIES = 50  # of one Gaussian in eqs. 8 and 9, as published
+MAX_COPIES = 50  # largest number of copies of one Gaussian in eqs. 8 and 9, as published
 WEIGHT_STEPS = 2**24  # opacities become integer weights, whose sums are exact
 
 
 class Relocate(Rule):
-    """Move faint Gaussians onto opaque ones, sampled by opacity, and preserve the opacity there (eqs. 8 and 9).
+    """Move faint Gaussians onto others, sampled with opacities as weights, and keep the opacity there (eqs. 8 and 9).
 
     `growth` adds Gaussians in the same way, up to the limit of the edit (`max_gaussians`, `budget`, memory).
     """

@@ -56,7 +56,7 @@ class PruneUseless(Rule):
     weight_per_view: UnitInterval = 0.99
     """Fraction of a view's weight that its useful Gaussians make up."""
     views: Annotated[int, Field(ge=1)] | None = None
-    """Number of training views, sampled by seed and step; default: all."""
+    """Number of training views, sampled at random by seed and step; default: all."""
     views_below: Annotated[int, Field(ge=0)] = 2
     """Gaussians that are useful in fewer views are removed."""
     weight_total: UnitInterval = 0.999

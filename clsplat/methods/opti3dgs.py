@@ -43,7 +43,7 @@ class Haar(TrainingModule):
     rate: NonNegative = 1.0e-4
     """Learning rate of the filter (Adam); it determines how fast details return."""
     weight: NonNegative = 0.05
-    """Weight of the loss that pulls the filter to Haar's."""
+    """Weight of the loss that pulls the filter toward Haar's filter."""
 
     def create_state(self, run: Run) -> "HaarState":
         return HaarState(self)
@@ -84,7 +84,7 @@ class HaarState(ModuleState):
         step.planes = apply_filter(step.planes, self.filter)
 
     def before_losses(self, step: TrainingStep) -> None:
-        """Compute the photo's gradient before the losses run, because a loss keeps only the sums of its last call."""
+        """Compute the photo's gradient first, because a loss keeps only the sums of its last call."""
         self.settings.check_losses(step.loss_settings)
         gradient = photograph_gradient(step.loss_settings, step.comparison)
         if step.planes.mask is not None:

@@ -51,12 +51,12 @@ def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
 
 
 class ScoredRule(Rule):
-    """Base class of rules that sample Gaussians by score.  Rules with the same `views` share the scores."""
+    """Base class of rules that sample Gaussians with weights from scores.  Rules with the same `views` share scores."""
 
     training_keys: ClassVar[frozenset[str]] = frozenset({"views"})
 
     views: Annotated[int, Field(ge=1)] = 10
-    """Number of training views, sampled by seed and step; all if there are fewer."""
+    """Number of training views, sampled at random by seed and step; all if there are fewer."""
 
     @property
     def statistics(self) -> set[str]:
@@ -75,7 +75,8 @@ class ScoredRule(Rule):
 class GrowScored(ScoredRule):
     """Undo the part of earlier rules' growth that exceeds the limit of the edit (`max_gaussians`, `budget`, memory).
 
-    Gaussians that may grow are sampled by score.  Clones and splits share the limit in proportion to their numbers.
+    Gaussians that may grow are sampled with their scores as weights.  Clones and splits share the limit in proportion
+    to their numbers.
     """
 
     type: Literal["grow_scored"] = "grow_scored"
@@ -100,7 +101,7 @@ class GrowScored(ScoredRule):
 
 
 class PruneScored(SampledPruning, ScoredRule):
-    """Remove a fraction of the faint and of the large Gaussians, sampled by 1 / score."""
+    """Remove a fraction of the faint and of the large Gaussians, sampled with weights 1 / score."""
 
     type: Literal["prune_scored"] = "prune_scored"
 

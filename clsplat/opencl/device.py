@@ -36,7 +36,7 @@ warnings.filterwarnings("ignore", category=cl.CompilerWarning)  # some runtimes 
 
 @contextmanager
 def raising_device_errors(action: str, device_name: str) -> Iterator[None]:
-    """Convert runtime errors in the block to MemoryLimitError or DeviceError; `action` describes the block.
+    """Convert OpenCL errors in the block to MemoryLimitError or DeviceError; `action` describes the block.
 
     Some runtimes allocate device memory on first use, so that a launch or a copy may be the first call to fail.
     """
@@ -59,7 +59,7 @@ class Timings:
     def __init__(self, device_name: str) -> None:
         self.device_name = device_name
         self.sampling = False
-        self.section = "other"  # part of a training step, for kernels that `records.STAGES` does not list
+        self.section = "other"  # current part of a step, for kernels that `records.STAGES` does not list
         self._events: list[tuple[str, str, Any]] = []
 
     def add(self, name: str, event: Any) -> None:
@@ -119,7 +119,7 @@ class Array:
         return math.prod(self.shape) * self.dtype.itemsize
 
     def get(self) -> NDArray[Any]:
-        """Copy the array to the host, after waiting for the device.  Raises MemoryLimitError, DeviceError."""
+        """Wait for the device, and copy the array to the host.  Raises MemoryLimitError, DeviceError."""
         host = np.empty(self.shape, self.dtype)
         self.device.recording.invalidate()
         if host.size:
@@ -172,7 +172,7 @@ class Array:
         self.device.recording.invalidate()
         with self.device.raising_errors("a copy to the device"):
             copy = cl.enqueue_copy(self.device.queue, self.buffer, host, is_blocking=False)
-        self.buffer.copy = copy  # pyopencl waits for a copy when its event is deleted
+        self.buffer.copy = copy  # keep the event: pyopencl would wait for the copy if it were deleted
 
     def fill(self, value: float) -> None:
         """Set every value of an array of floats or 32-bit integers."""
@@ -295,7 +295,7 @@ class Device:
             self.queue.finish()
 
     def raising_errors(self, action: str) -> AbstractContextManager[None]:
-        """Convert runtime errors in the block, which `action` describes (see `raising_device_errors`)."""
+        """Convert OpenCL errors in the block, which `action` describes (see `raising_device_errors`)."""
         return raising_device_errors(action, self.info.name)
 
 
@@ -432,7 +432,7 @@ class Kernel:
 
     def __init__(self, device: "Device", label: str, create: Callable[[], Any], arguments: list[Argument]) -> None:
         self.label, self.arguments = label, arguments
-        self.spare_kernels: list[Any] = []  # copies of the kernel that no plan uses
+        self.spare_kernels: list[Any] = []  # unused copies of the kernel, for new plans
         self._device, self._create = device, create
         self._kernel = kernel = self.take()
         info, cl_device = cl.kernel_work_group_info, device.context.devices[0]
@@ -445,7 +445,7 @@ class Kernel:
             )
 
     def take(self) -> Any:
-        """Return a copy of the kernel, whose arguments no other launch sets."""
+        """Return a copy of the kernel for one launch, so that no other launch changes its arguments."""
         if self.spare_kernels:
             return self.spare_kernels.pop()
         kernel = self._create()
@@ -464,7 +464,7 @@ class Kernel:
         if 0 in size:
             return
         arguments, plan = self._check_arguments(values), self._device.recording.plan
-        with self._device.lock, self._device.raising_errors(self.label):  # arguments must not change until enqueued
+        with self._device.lock, self._device.raising_errors(self.label):  # arguments must not change before the launch
             if plan is None:
                 self._kernel.set_args(*arguments)
             kernel = plan.add(self, size, local, arguments) if plan else self._kernel

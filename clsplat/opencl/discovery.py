@@ -48,7 +48,7 @@ class DeviceInfo:
         return f"{self.name} ({self.kind}) on {self.platform}"
 
     def fault(self) -> str | None:
-        """Return None if the device supports large enough work-groups and runs a test kernel, else the fault."""
+        """Return why the device does not work: small work-groups, or a failing test kernel; None if it works."""
         min_group = int(tuning_macros(self, resolve_schedule(self, "auto"))["GROUP"])
         if self.group < min_group:
             return f"its work-groups have at most {self.group} items; {min_group} are needed"
@@ -78,7 +78,7 @@ def list_devices() -> list[DeviceInfo]:
 
 
 def get_platforms() -> list[Any]:
-    """Return the platforms of the loader, or an empty list without runtimes.  Raises the errors of `check_runtimes`."""
+    """Return the platforms of the loader, or an empty list without runtimes.  Raises errors like `check_runtimes`."""
     runtimes.check_runtimes(f"{cl.VERSION_TEXT} {cl.__file__}")
     with _warn_on_error("the OpenCL loader fails", "PLATFORM_NOT_FOUND_KHR"):
         return list(cl.get_platforms())
@@ -150,7 +150,7 @@ def choose_device(device_name: str | None = None) -> DeviceInfo:
 def _rank(info: DeviceInfo) -> tuple[int, bool, int]:
     """Return the sort key: GPUs (discrete first, by compute units times clock), then CPUs, then other devices.
 
-    The number of units alone does not suffice, because vendors define compute units differently.
+    The number of units is not enough to compare GPUs, because vendors define compute units differently.
     """
     is_gpu = info.kind == "GPU"
     return ("GPU", "CPU", "other").index(info.kind), is_gpu and info.unified, -info.units * info.clock if is_gpu else 0

@@ -32,7 +32,7 @@ INSTALL_ADVICE = (
 VARIABLES = ("POCL_DEVICES", "OCL_ICD_VENDORS", "OCL_ICD_FILENAMES")  # any of them may hide a runtime
 LOADER_VARIABLES = (*VARIABLES, "LD_LIBRARY_PATH", "LD_PRELOAD")  # these determine which libraries are loaded
 MIN_ADDRESS_SPACE = 1800 << 20  # bytes: with two cores, a run needs about this much
-LOADING_SECONDS = 60  # drivers of large servers may take ten
+LOADING_SECONDS = 60  # drivers of large servers may take 10 s
 LOADING, LOADED = "clsplat loads the runtimes", "clsplat has listed the devices"  # lines of the child process
 _TIMEOUT = f"a test kernel did not finish in {PROBE_SECONDS} s"
 _NOEXEC = "PoCL's cache is on a file system mounted with `noexec`: mount it with `exec`, or set POCL_CACHE_DIR"
@@ -74,7 +74,7 @@ def no_device_advice() -> str:
 
 def _user_variables() -> str:
     """Return the variables among VARIABLES that the user has set, as `NAME=VALUE, …`; '' if there are none."""
-    folders = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # in values that `prepare` has set
+    folders = (str(cache_folder()), str(Path(sysconfig.get_path("data"))))  # prefixes of values that `prepare` sets
     values = {name: os.environ[name] for name in VARIABLES if not os.environ.get(name, folders[0]).startswith(folders)}
     return ", ".join(f"{name}={quote(value)}" for name, value in values.items())
 
@@ -90,7 +90,7 @@ def check_runtimes(loader: str) -> None:
     """
     require_space()
     limit = process_limit("RLIMIT_AS")
-    if limit is not None and limit < MIN_ADDRESS_SPACE:  # runtimes crash or hang when they run out of it
+    if limit is not None and limit < MIN_ADDRESS_SPACE:  # runtimes crash or hang without enough address space
         raise no_device_error(f"OpenCL runtimes need {MIN_ADDRESS_SPACE >> 20} MiB of address space")
     drivers = _drivers()
     variables = [os.environ.get(name) for name in LOADER_VARIABLES]
@@ -167,7 +167,7 @@ def _add_intel_runtime() -> None:
 
 
 def probe_fault(key: str, platform: int, device: int) -> str | None:
-    """Return None if the device builds and runs a test kernel, else a sentence with the fault and a remedy.
+    """Test a device: return None if it builds and runs a test kernel, else a sentence with the fault and a remedy.
 
     key: identifies the runtime.  Only successes are recorded, so that a repaired runtime is tested again.  A device
     that fails is tested again with empty caches of built kernels.

@@ -50,9 +50,8 @@ class Auto(Backdrop):
     """Learn a sky if the photographs show one.
 
     Before training, the photographs are searched for sky: smooth, bright or blue regions that touch the upper edge and
-    are far from all points of the dataset.  A photograph in which more than a quarter of such pixels are below the
-    horizon counts as a photograph without sky.  If no sky is chosen, the model is bit-identical to one without this
-    key.
+    are far from all points of the dataset.  A photograph counts as one without sky if more than a quarter of these
+    pixels are below the horizon.  If `auto` chooses no sky, the model is bit-identical to one without this key.
     """
 
     output_keys: ClassVar[frozenset[str]] = frozenset({"chosen", "reason"})
@@ -70,7 +69,7 @@ class Auto(Backdrop):
     """Written by a run: the reason for the choice."""
 
     def active_values(self) -> dict[str, Any]:
-        return {}  # conflicts are not errors, since a run then chooses no sky
+        return {}  # conflicts are not errors: a run with a conflict chooses no sky
 
     @property
     def sky(self) -> EnvironmentMap | None:

@@ -12,8 +12,8 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.view import View
 
 RAY_MARGIN = constants()["RAY_MARGIN"]
-TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # per side
-PIXELS_MAX = 2**30  # in whole tiles: kernels index up to four planes of an image in 32 bits
+TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # largest number per side
+PIXELS_MAX = 2**30  # of an image in whole tiles: kernels index up to four planes in 32 bits
 
 # camera_t of cl_kernels/common.h
 CAMERA = np.dtype(
@@ -37,8 +37,8 @@ class DeviceCamera:
     tiles_x: int
     tiles_y: int
     tile: int
-    view_index: int | None = None  # in the table HIDDEN; None renders all Gaussians
-    time: float | None = None  # of the scene, in [0, 1], at which moving Gaussians are rendered
+    view_index: int | None = None  # index of the view in the table HIDDEN; None renders all Gaussians
+    time: float | None = None  # time in [0, 1] at which moving Gaussians are rendered
     source: View | None = field(default=None, repr=False, compare=False)  # the view that has these values
     values: NDArray[Any] = field(default_factory=lambda: np.zeros((), CAMERA), repr=False, compare=False)  # on the host
 
@@ -76,7 +76,7 @@ def move_camera(
     values = camera.values.copy()
     for name in ("fx", "fy"):
         values[name] = float(values[name]) * zoom
-    for name in ("ray_x_min", "ray_x_max", "ray_y_min", "ray_y_max"):  # tangents
+    for name in ("ray_x_min", "ray_x_max", "ray_y_min", "ray_y_max"):  # tangents of angles
         values[name] = float(values[name]) / zoom
     values["world_to_camera"] = world_to_camera.ravel()
     values["position"] = -world_to_camera[:, :3].T @ world_to_camera[:, 3]

@@ -98,9 +98,9 @@ def measure_intervals(
 
 
 class ScreenFilter(Settings):
-    """A blur of splats in the image; a subclass with further keys overrides `parameters`."""
+    """A blur of splats in the image.  A subclass with more keys must override `parameters`."""
 
-    pixel_box: ClassVar[bool] = False  # splats are integrated over the pixel's box; the fields below are for viewers
+    pixel_box: ClassVar[bool] = False  # whether to integrate splats over a pixel's box; other fields are for viewers
     variance: Annotated[float, Field(ge=0, lt=MAX_NUMBER)]
     """Variance added to every splat, px²."""
     compensate: Literal[0, 1]

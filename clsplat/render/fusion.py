@@ -17,7 +17,7 @@ SIDE, FIELDS = int(CONSTANTS["BLOCK_SIDE"]), int(CONSTANTS["POINT_FIELDS"])
 CHUNK = 1024  # blocks per buffer, about 100 MB
 MAX_PIXEL = 4.0  # size of a pixel at the farthest surface, in voxels
 MIN_VIEWS = 2  # views that must see a surface in a block, or a grid point
-POINT_BYTES = 4 * FIELDS + 4 + 4 + 16  # on the device; value, color, and share of the mesh on the host
+POINT_BYTES = 4 * FIELDS + 4 + 4 + 16  # memory per grid point: on the device; value, color, and mesh on the host
 
 
 @dataclass(frozen=True)

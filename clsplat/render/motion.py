@@ -14,7 +14,7 @@ from clsplat.render.camera import DeviceCamera
 from clsplat.render.workspace import Workspace
 
 LOG = logging.getLogger("clsplat")
-DEFAULT_TIME = 0.0  # for cameras without a time
+DEFAULT_TIME = 0.0  # time of cameras without a time
 
 
 def evaluate_motion(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> DeviceModel:

@@ -22,7 +22,7 @@ class Layers:
     image: Floats  # [height, width, 3], with background
     alpha: Floats  # [height, width] in [0, 1]
     depth: Floats | None  # [height, width] scene units, alpha-weighted mean; 0 where alpha is 0
-    median_depth: Floats | None = None  # [height, width] scene units, where transmittance falls below ½, or 0
+    median_depth: Floats | None = None  # [height, width] scene units, depth at which transmittance falls below ½, or 0
     normals: Floats | None = None  # [height, width, 3] unit, in scene axes, from the mean depth; 0: unknown
 
     @property

@@ -66,9 +66,9 @@ class Camera:
 
 Floats = NDArray[np.float64]
 Distortion = Callable[..., tuple[Floats, Floats]]  # f(u, v, k), or f(x, y, k, z) for directions in WIDE models
-BORDER_POINTS = 200  # per edge of a photograph
-MAX_ITERATIONS = 50  # of Newton's method
-MAX_ERROR = 1.0e-6  # of the result of Newton's method, normalized units
+BORDER_POINTS = 200  # points per edge of a photograph
+MAX_ITERATIONS = 50  # iterations of Newton's method
+MAX_ERROR = 1.0e-6  # largest error of the result of Newton's method, normalized units
 MAX_DIFFERENCE = 1.0e-3  # between a ray and its value after distortion and undistortion, normalized units
 MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond it, a pinhole image is mostly stretched edges
 MAX_GROWTH = 2.0  # size of an undistorted photograph, relative to the original
@@ -320,7 +320,7 @@ class Lens:
         return fx * x + cx, fy * y + cy
 
     def project(self, points: Floats) -> Floats:
-        """Project points in camera space, [M, 3], to pixels, [M, 2].  Points behind the camera need a wide lens."""
+        """Project points in camera space, [M, 3], to pixels, [M, 2].  Only wide lenses see points behind the camera."""
         x, y, z = points.T
         return np.stack(self.distort(x, y, z) if self.is_wide else self.distort(x / z, y / z), axis=1)
 
@@ -351,8 +351,9 @@ class Lens:
     def pinhole(self) -> Camera:
         """The camera of the undistorted photograph, with the same focal lengths.
 
-        Its image is the largest rectangle in which all pixels are defined.  With `keep_border`, it is the smallest
-        rectangle that contains the photograph, limited to 60 degrees on each side and to twice the photograph's size.
+        Its image is the largest rectangle in which all pixels are defined.  With `keep_border`, its image is the
+        smallest rectangle that contains the photograph, limited to 60 degrees on each side and to twice the
+        photograph's size.
         For a wide photograph, the result is the camera of the face.  Raises DataError if no pixels are left.
         """
         if self.is_wide:
@@ -436,7 +437,7 @@ def _newton_step(distortion: Distortion, k: Sequence[float], points: Floats, tar
     return np.stack([u + (j11 * dx - j01 * dy) / det, v + (j00 * dy - j10 * dx) / det])
 
 
-@lru_cache(maxsize=2)  # for portrait and landscape photographs of a phone; 8 bytes per pixel each
+@lru_cache(maxsize=2)  # one for portrait and one for landscape photographs; 8 bytes per pixel each
 def _maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the x and y maps of cv2.remap, [H, W] each: the position of each pixel of `pinhole` in the photograph."""
     x, y = lens.distort(*_rays(lens.pinhole))

@@ -65,7 +65,7 @@ def plan_copies(views: Sequence[View], folder: Path) -> dict[Path, Path]:
 
 LOG = logging.getLogger("clsplat")
 
-# cameras.json, as the reference implementation of 3DGS writes it next to a model (Kerbl et al. 2023).
+# cameras.json, which the reference implementation of 3DGS writes next to a model (Kerbl et al. 2023).
 
 INRIA_FILE = "cameras.json"
 MAX_BYTES = 1 << 27
@@ -121,7 +121,7 @@ def _make_view(frame: JsonFrame, index: int) -> View:
     if min(width, height) < 1 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
         raise DataError(
             f"{frame.source}: the camera is {width:g}x{height:g} with focal lengths {fx:g}, {fy:g}; expected positive "
-            f"numbers, sizes of at most {MAX_SIDE}: export the file again"
+            f"numbers, and sizes of at most {MAX_SIDE}: export the file again"
         )
     cx, cy = frame.number("cx"), frame.number("cy")
     camera = Camera(int(width), int(height), fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
@@ -143,7 +143,7 @@ def _read_array(frame: JsonFrame, key: str, shape: tuple[int, ...]) -> Floats:
 
 # nerfstudio's transforms.json, with points3d.ply next to it.
 
-DISTORTION = {  # for each of COLMAP's models: nerfstudio's model, and the names of the distortion parameters
+DISTORTION = {  # by COLMAP's model: nerfstudio's model, and its names of the distortion parameters
     "SIMPLE_PINHOLE": ("OPENCV", ()),
     "PINHOLE": ("OPENCV", ()),
     "SIMPLE_RADIAL": ("OPENCV", ("k1",)),

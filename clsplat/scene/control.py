@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 # Points that are marked in photos.
 
-MIN_ANGLE = math.radians(1)  # between two rays to a point; smaller ones do not determine its depth
+MIN_ANGLE = math.radians(1)  # smallest angle between two rays to a point that determines its depth
 MAX_MARK_ERROR = 10.0  # px from a mark to the point of the scene that it selects
 MIN_ERROR = 2.0  # px: a mark with a smaller error is not an outlier
 
@@ -265,7 +265,7 @@ FALSE_EASTING, FALSE_NORTHING = 500_000.0, 10_000_000.0  # m
 class GpsPositions:
     """The GPS positions of photos in one UTM zone."""
 
-    views: list[View]  # of the photos with a position, one for each photo
+    views: list[View]  # one view of each photo with a position
     positions: Floats = field(repr=False)  # [N, 3] easting, northing, altitude, m
     epsg: int  # code of the coordinate system
 

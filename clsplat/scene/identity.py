@@ -29,7 +29,7 @@ from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 
 MAX_THREADS = 8  # each keeps one photograph in memory
 MAX_CACHE_BYTES = 1 << 24  # about 200 000 photographs
-MAX_NAMES = 3  # in a message
+MAX_NAMES = 3  # names in a message
 Entry = tuple[int, int, int]  # width, height, and flags as bits: blank, excludes every pixel as a mask, transparent
 
 
@@ -38,7 +38,7 @@ class ImageFile:
     """The result of decoding an image file."""
 
     digest: str = ""  # SHA-256 of the content; "" if the file cannot be read
-    size: Size | None = None  # as stored; None if the file cannot be decoded
+    size: Size | None = None  # size as stored; None if the file cannot be decoded
     orientation: int = 1  # from EXIF; 1: upright
     is_truncated: bool = False  # whether the end of the file is missing
     fault: str = ""  # the error that training would report
@@ -172,12 +172,12 @@ def _parse_entry(line: bytes) -> tuple[str, Entry] | None:
     return fields[0].decode(errors="replace"), (int(fields[1]), int(fields[2]), int(fields[3]))
 
 
-Row = dict[str, str]  # of a view: hashes of its photograph, mask, and camera ("" if missing), and its time, if any
+Row = dict[str, str]  # hashes of a view's photograph, mask, and camera ("" if missing), and its time, if any
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Hashes of the points and of the views; views are grouped by split and ordered as in the scene.
+    """Hashes of the points and of the views.  The views are grouped by split, in the order of the scene.
 
     Cameras and points are hashed after parsing, so rewriting a file with the same values changes nothing.
     """

@@ -147,8 +147,8 @@ def strip_png_metadata(data: bytes) -> bytes:
     raise ValueError(f"byte {offset}: expected another chunk, but only {len(data) - offset} bytes are left")
 
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our messages name the file; those of OpenCV do not
-MAX_BYTES = (1 << 31) - 1  # per image file, the limit of OpenCV
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # OpenCV's messages do not name the file; ours do
+MAX_BYTES = (1 << 31) - 1  # largest image file that OpenCV decodes
 GRAY_FLAGS = {  # OpenCV's flag for decoding to gray, by the divisor of the size
     1: cv2.IMREAD_GRAYSCALE,
     2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
@@ -252,12 +252,12 @@ def _reset_orientation(data: bytes) -> bytes:
 
 
 def _decode(data: bytes, path: Path, flags: int) -> NDArray[Any]:
-    if is_truncated(data):  # some versions of OpenCV fill the rest with gray
+    if is_truncated(data):  # some versions of OpenCV would fill the missing rows with gray
         raise DataError(f"{path}: the end of the file is missing; copy it again")
     pixels, fault = None, ""
     if flags & cv2.IMREAD_IGNORE_ORIENTATION:
         data = _reset_orientation(data)
-    try:  # not cv2.imread: that needs ASCII paths on Windows
+    try:  # not cv2.imread, which needs ASCII paths on Windows
         pixels = cv2.imdecode(np.frombuffer(strip_png_metadata(data), np.uint8), flags)
     except ValueError as error:
         fault = f" ({error})"
@@ -271,7 +271,7 @@ def _decode(data: bytes, path: Path, flags: int) -> NDArray[Any]:
 
 # Read the camera settings of a photograph: from EXIF 2.3 in JPEG files, or from a file next to images without EXIF.
 
-EXPOSURES_FILE = "exposures.json"  # in a folder of images
+EXPOSURES_FILE = "exposures.json"  # file name in a folder of images
 EXIF_IFD = 0x8769  # tag with the offset of the exposure tags
 GPS_IFD, SOUTH, LATITUDE, WEST, LONGITUDE, BELOW, ALTITUDE = 0x8825, 1, 2, 3, 4, 5, 6  # signs: SOUTH, WEST, BELOW
 SECONDS, APERTURE, ISO = 0x829A, 0x829D, 0x8827
@@ -363,7 +363,7 @@ def _read_tags(path: Path) -> dict[int, Value]:
         return tags
     segment_start, length = segment
     block = head[segment_start + 10 : segment_start + 2 + length]
-    with suppress(struct.error, KeyError, ValueError):  # truncated, or without EXIF tags
+    with suppress(struct.error, KeyError, ValueError):  # the data may be truncated, or contain no tags
         order = {b"II": "<", b"MM": ">"}[block[:2]]
         (start,) = struct.unpack_from(order + "I", block, 4)
         tags.update(_read_ifd(block, order, int(start)))

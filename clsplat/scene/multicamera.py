@@ -78,7 +78,7 @@ def _find_camera_names(path: Path) -> set[str]:
 
 
 def _find_frames(path: Path) -> dict[str, list[Path]]:
-    """Return the sorted frames of each camera.  Raises DataError unless all have the same number, at least 2."""
+    """Return the sorted frames of each camera.  Raises DataError unless the numbers are equal and at least 2."""
     entries = _list_entries(path)
     frames = {
         entry.name: sorted(filter(is_image, entry.iterdir()), key=_natural_order) for entry in entries if entry.is_dir()

@@ -16,14 +16,14 @@ from clsplat.scene.view import View
 
 Floats = NDArray[np.floating]
 Indices = NDArray[np.integer]
-LONG_SIDE = 160  # px, of the compared photographs
+LONG_SIDE = 160  # px, long side of the compared photographs
 PLANES = 64  # evenly spaced in inverse depth
 MIN_DEPTH, MAX_DEPTH = 0.1, 20.0  # times the distance to the point that the cameras look at
 NEIGHBORS = 4  # photographs with which each photograph is compared
-WINDOW = 5  # px
-MAX_COST_RATIO = 0.6  # largest ratio of the cost of the best plane to the mean cost of all planes
+WINDOW = 5  # px, side of the square over which colors are compared
+MAX_COST_RATIO = 0.6  # largest accepted ratio of the cost of the best plane to the mean cost of all planes
 MIN_VOTES = 2  # adjacent photographs that must confirm the depth of a point
-MAX_DIFFERENCE = 1.5  # planes between depths that agree
+MAX_DIFFERENCE = 1.5  # largest difference between depths that agree, in planes
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ def _homography(view: View, other: View, inverse_depth: float) -> Floats:
 
 
 def _calibration(view: View) -> Floats:
-    c = view.camera  # OpenCV has pixel centers at integers, hence the halves
+    c = view.camera  # subtract 1/2, because OpenCV has pixel centers at integers
     return np.array([[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]])
 
 

@@ -18,7 +18,7 @@ from clsplat.scene.view import Floats
 
 logger = logging.getLogger("clsplat")
 
-MAX_VALUE = 1e15  # of any number in a dataset; the squares of much larger numbers overflow float32
+MAX_VALUE = 1e15  # largest number in a dataset; the squares of much larger numbers overflow float32
 BELOW_MAX = f"a number between -{MAX_VALUE:g} and {MAX_VALUE:g}"
 RGB = ("red", "green", "blue")
 TIME = "time"  # name of the property with the time of a point, in the unit of the frame times

@@ -13,9 +13,9 @@ from clsplat.scene.reprojection import reprojection_errors
 from clsplat.scene.scene import PointCloud, Scene
 from clsplat.scene.view import MIN_WHITE, View, load_mask, load_transparency, sample_views
 
-NEAR_QUANTILE = 0.01  # of the depths of observed points, since the nearest few points are usually wrong
-NEAR_FRACTION = 0.04  # of the extent
-MAX_POINTS = 10_000  # of a cloud, used to estimate depths
+NEAR_QUANTILE = 0.01  # quantile of the depths of observed points; the nearest few points are usually wrong
+NEAR_FRACTION = 0.04  # near plane, as a fraction of the extent
+MAX_POINTS = 10_000  # points of a cloud that are used to estimate depths
 
 
 @dataclass
@@ -44,7 +44,7 @@ def near_depth(scene: Scene) -> float | None:
     points inside its image.  Returns None if no view observes a point.
     """
     views = scene.merge_validation().split("train")
-    with np.errstate(all="ignore"):  # points of a damaged file
+    with np.errstate(all="ignore"):  # a damaged file may contain huge points
         visible_depths = [depths[depths < np.inf] for depths in (_observed_depths(scene, view) for view in views)]
     return float(np.quantile(np.concatenate(visible_depths), NEAR_QUANTILE)) if any(map(len, visible_depths)) else None
 
@@ -114,7 +114,7 @@ def is_blurred(values: NDArray[np.float64], median: NDArray[np.float64]) -> bool
 
 # Blank photographs, and masks that exclude everything.
 
-DARK, PLAIN = 8, 2  # of 255: upper bounds of the levels of a black image, and of their range in a plain image
+DARK, PLAIN = 8, 2  # of 255: largest level of a black image, and largest range of levels in a plain image
 
 
 def is_blank(pixels: NDArray[Any]) -> bool:

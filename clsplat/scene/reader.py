@@ -27,7 +27,7 @@ class Parts:
 
     path: Path
     kind: str = "none"
-    views: list[View] = field(default_factory=list)  # whether or not their files exist
+    views: list[View] = field(default_factory=list)  # views, even if their files do not exist
     models: dict[str, str] = field(default_factory=dict)  # camera model of each view, if the dataset names it
     observed: dict[str, int] = field(default_factory=dict)  # number of points that each view observes, if known
     submodels: dict[str, int] = field(default_factory=dict)  # image counts of COLMAP models, the one in use first
@@ -67,11 +67,11 @@ class Reader(ABC):
     again, as in a notebook, replaces the earlier one.
     """
 
-    name: ClassVar[str]  # of the format
+    name: ClassVar[str]  # name of the format
     expects: ClassVar[str]  # the file that marks the format, or a short description for custom `matches`
     missing: Missing = "refuse"  # what to do about missing photographs
     root: Path | None = None  # folder of the scene, in which files are looked up; None: the folder of the dataset
-    folder: Path = Path()  # of the dataset, at or below `root`
+    folder: Path = Path()  # folder of the dataset, at or below `root`
     choice: str = ""  # why this dataset is used, if there are several; for `note`
     subclasses: ClassVar[list[type["Reader"]]] = []  # every subclass, in the order of definition
 

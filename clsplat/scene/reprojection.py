@@ -23,7 +23,7 @@ def reprojection_residuals(view: View, positions: NDArray[np.floating], observat
     """
     original = view.lens or view.camera
     size = np.array([original.width, original.height])
-    is_plausible = np.all(np.abs(observations - size / 2) <= size, axis=1, keepdims=True)  # not so in damaged files
+    is_plausible = np.all(np.abs(observations - size / 2) <= size, axis=1, keepdims=True)  # files may be damaged
     return np.where(is_plausible, observations - project_points(view, positions), np.nan)
 
 

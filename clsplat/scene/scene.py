@@ -34,7 +34,7 @@ class Tracks:
     positions: NDArray[np.floating]  # [M, 3], scene units
     rows: Mapping[str, NDArray[np.int64]]  # rows of `positions` by view name, in order of the point ids
     residuals: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    # by view name, [K, 2] px of the original photograph: from the projection of each point to its observation
+    # by view name, [K, 2] px of the original photograph: vectors from the projection of each point to its observation
 
     def shifted(self, origin: Floats) -> "Tracks":
         """Return the tracks in coordinates relative to `origin`, [3]."""
@@ -66,7 +66,7 @@ MAX_OFFSET = 100  # times the median distance of the points; float32 then resolv
 MAX_OUTLIERS = 0.2  # fraction of the cameras
 ROUNDING = 1e-6  # times the largest coordinate; centers that differ by less count as equal
 MAX_THUMBNAILS = 4
-IN_MEMORY = Path("<memory>")  # of a scene without a dataset
+IN_MEMORY = Path("<memory>")  # path of a scene without a dataset
 SPLITS = ("train", "test", "validation")
 
 

@@ -67,7 +67,7 @@ def rotation_between(start: Floats, end: Floats) -> Floats:
 
 # Least squares (Umeyama 1991), and outliers.
 
-MIN_SPREAD = 1e-3  # of points across their main direction, relative to the spread along it
+MIN_SPREAD = 1e-3  # smallest spread of points across their main direction, relative to the spread along it
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class Correspondences:
         )
 
 
-ROUNDING = 1e-6  # of the spread of the targets: smaller distances are rounding errors
+ROUNDING = 1e-6  # relative to the spread of the targets; smaller distances are rounding errors
 OUTLIER_DISTANCE = 3.0  # times the median distance; for normal errors, 4.6 standard deviations of a coordinate
 MAX_SAMPLES = 1000
 MAX_ROUNDS = 20

@@ -31,9 +31,9 @@ LENSES = {  # the parameters of each camera_model, in COLMAP's order
     **dict.fromkeys(("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"), ("k1", "k2", "k3", "k4")),
     "EQUIRECTANGULAR": (),
 }
-COLMAP_MODELS = {4: "OPENCV", 8: "FULL_OPENCV"}  # by the number of parameters
+COLMAP_MODELS = {4: "OPENCV", 8: "FULL_OPENCV"}  # by number of distortion parameters
 MAX_FRAMES = 100_000  # ten times the largest captures that are trained as one scene; reading takes about 15 s
-MIN_SCALE = 1e-6  # of the rotation in a pose
+MIN_SCALE = 1e-6  # smallest scale factor in the rotation of a pose
 MAX_BYTES = 1 << 27  # exporters write at most 1.3 KB for a frame
 
 

@@ -17,7 +17,7 @@ from clsplat.scene.camera import FACES, MODELS, Camera, Lens, intern_lens
 from clsplat.scene.images import CameraExposure, read_exif_exposure, read_exposures, read_image, read_stored_size
 
 Floats = NDArray[np.floating]
-ROTATION_TOLERANCE = 2e-3  # of R Rᵀ: files are checked to 1e-3, and inverting adds to the error
+ROTATION_TOLERANCE = 2e-3  # error of R Rᵀ: files are checked to 1e-3, and inverting adds to the error
 
 
 def validate_pose(name: str, pose: ArrayLike) -> Floats:
@@ -71,7 +71,7 @@ class View:
     image_path: Path = NO_FILE
     mask_path: Path | None = None  # an image of the photograph's size, white in valid pixels
     alpha: Alpha = "transparency"
-    lens: Lens | None = None  # of the photograph on disk, if it has distortion
+    lens: Lens | None = None  # lens of the photograph on disk, if it has distortion
     downscale: float = 1  # divisor of the original photograph's size
     time: float | None = None  # timestamp in [0, 1]; None: the scene is static
     static_path: Path | None = None  # an image of the photograph's size, white in pixels without motion
@@ -389,7 +389,7 @@ def zoom_lens(lens: Lens, factor: float) -> Lens:
             f"the focal length of the {lens.model} lens cannot be changed; expected one of {', '.join(DEGREES)}: "
             "run `clsplat data undistort` first"
         )
-    powers = *[1] * MODELS[lens.model][0], 0, 0, *DEGREES[lens.model]  # of focal lengths, principal point, distortion
+    powers = *[1] * MODELS[lens.model][0], 0, 0, *DEGREES[lens.model]  # for focal lengths, principal point, distortion
     params = tuple(value * factor**degree for value, degree in zip(lens.params, powers, strict=True))
     return replace(lens, params=params)
 

@@ -18,7 +18,7 @@ from clsplat.scene.scene import HOLDOUT, Scene, camera_extent, every_nth, remain
 from clsplat.scene.view import photograph_name
 
 LOG = logging.getLogger("clsplat")
-MAX_BYTES = 1 << 24  # of a list of names
+MAX_BYTES = 1 << 24  # largest file with a list of names
 ExcludedBy = Literal["holdout", "train", "missing"]
 ExcludedNames = Mapping[ExcludedBy, Sequence[str]]  # names to exclude, by reason: a setting, or missing files
 NO_NAMES: ExcludedNames = {}

@@ -18,11 +18,11 @@ MIN_UP = 0.2  # smallest component of the mean up axis that determines the sign 
 MIN_AGREEMENT, MAX_TILT = 0.5, 75.0  # a mean up axis longer than MIN_AGREEMENT is at most MAX_TILT degrees off
 PRIOR = 1e-3  # weight of the center of the splats, which determines the distance if all axes are parallel
 START_CAMERA = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a scene without views
-QUANTILES = 0.05, 0.95  # of the splats along each axis: the faces of the box to look at
-DISTANCE = 2.2  # of the start view from the center of the box, divided by half the diagonal of the box
-TOWARD_START = np.array([0.35, -0.25, -0.9])  # from the center
+QUANTILES = 0.05, 0.95  # quantiles of the splats along each axis: the faces of the box to look at
+DISTANCE = 2.2  # from the start view to the center of the box, divided by half the diagonal of the box
+TOWARD_START = np.array([0.35, -0.25, -0.9])  # direction from the center to the start view
 NO_GROUND = "omit --level, or level the scene by its cameras with `clsplat align`"
-VISIBLE_FRACTION, MARGIN = 0.999, 1.05  # of the splats in the start view, and the space around them
+VISIBLE_FRACTION, MARGIN = 0.999, 1.05  # fraction of the splats in the start view, and a factor for space around them
 MAX_ZOOM_OUT = 2.0  # times the usual distance; splats that need more have a background, which may be outside the image
 
 
@@ -68,7 +68,7 @@ class Viewpoint:
 def _distance_to_show_all(start: View, offsets: NDArray[np.floating]) -> float:
     """Return the distance from the center at which `start` shows nearly all points, as multiples of TOWARD_START.
 
-    offsets: of the points from the center, [N, 3].
+    offsets: the points minus the center, [N, 3].
     """
     right, down, forward = start.world_to_camera[:, :3] @ offsets.T
     camera = start.camera
@@ -108,10 +108,10 @@ def up_direction(views: Sequence[View]) -> NDArray[np.float64]:
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
 
 
-MAX_SLOPE = np.radians(45)  # of a ground plane, from the expected up direction
+MAX_SLOPE = np.radians(45)  # largest angle between the normal of a ground plane and the expected up direction
 PLANES, PLANE_POINTS = 2000, 5000  # candidates, each through three points, and points to compare them with
-THICKNESS = 0.015  # of the ground, relative to the typical size of the points
-MIN_GROUND = 0.1  # fraction of the points
+THICKNESS = 0.015  # thickness of the ground, relative to the typical size of the points
+MIN_GROUND = 0.1  # smallest fraction of the points on the ground
 REFINEMENTS = 10
 
 

@@ -20,12 +20,12 @@ from clsplat.scene.view import View
 Floats = NDArray[np.floating]
 Bools = NDArray[np.bool_]
 Cells = NDArray[np.integer]  # [M, 3], indices in a grid
-LONG_SIDE = 400  # px, of the downscaled photographs
+LONG_SIDE = 400  # px, long side of the downscaled photographs
 MAX_VIEWS = 64  # largest number of views that are used as silhouettes
 MIN_RESOLUTION, MAX_RESOLUTION = 16, 256  # cells per side of the box
 HALF, OPAQUE = 127, 250  # alpha above which a pixel is in the silhouette, and from which its color is used
 MIN_VIEWS, MIN_FRACTION = 2, 0.25  # smallest number and fraction of views that must see a cell
-HALF_DIAGONAL = 0.75**0.5  # of a cube of side 1
+HALF_DIAGONAL = 0.75**0.5  # half the diagonal of a cube of side 1
 MAX_BEHIND = 2.0  # largest distance of a visible point behind the nearest point of its pixel, in cell sides
 
 

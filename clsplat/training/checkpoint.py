@@ -73,10 +73,10 @@ class State(BaseModel):
     degree: Annotated[int, Field(ge=0, le=3)]
     zero_fresh: list[str]
     updates: dict[str, Count]
-    scalars: dict[str, float]  # of rules and budgets
+    scalars: dict[str, float]  # state of rules and budgets
     modules: dict[str, dict[str, float]]  # scalars of training modules, by type
     best: Best | None  # the best model by validation
-    train_seconds: Seconds
+    train_seconds: Seconds  # wall-clock time of training
     cpu_seconds: Seconds  # of all threads, in the same time
     metrics: Metrics
     records: Count  # lines of metrics.jsonl
@@ -84,7 +84,7 @@ class State(BaseModel):
     changes: list[str]
     device: str
     inputs: str  # identity of the scene
-    file_hashes: dict[str, str]  # of the files that settings name, by path
+    file_hashes: dict[str, str]  # hashes of the files that settings name, by path
     pipeline: dict[str, Any]
 
     def is_trained(self, pipeline: dict[str, Any]) -> bool:
@@ -404,7 +404,7 @@ def _remove(files: Iterable[Path]) -> None:
         try:
             file.unlink(missing_ok=True)
         except OSError as error:
-            _warn_once(f"{file}: cannot be removed ({error.strerror}); it stays")
+            _warn_once(f"{file}: cannot be removed ({error.strerror}); a later save tries again")
 
 
 @cache

@@ -20,8 +20,8 @@ class TrainedField(ABC):
 
     kinds: ClassVar[dict[str, type["TrainedField"]]] = {}
     kind: ClassVar[str]
-    updates: int  # of Adam, for its bias correction
-    rate: float  # of the last step
+    updates: int  # number of Adam updates, for the bias correction
+    rate: float  # learning rate of the last step
 
     def __init_subclass__(cls) -> None:
         TrainedField.kinds[cls.kind] = cls

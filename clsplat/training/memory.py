@@ -33,13 +33,13 @@ Harmonics = Literal["auto", "device", "host"]  # memory of the bands above 0; au
 class MemoryPlan:
     """The device memory that training needs, and the memory that the device has, in bytes."""
 
-    gaussian: int  # per Gaussian, in tables and the frame
-    pair: int  # per pair
-    fixed: int  # photographs and planes of pixels
-    largest_table: int  # per Gaussian, in the largest single buffer
+    gaussian: int  # bytes per Gaussian, in tables and the frame
+    pair: int  # bytes per pair
+    fixed: int  # bytes of photographs and planes of pixels
+    largest_table: int  # bytes per Gaussian, in the largest single buffer
     memory: int  # total memory of the device
     allocation: int  # largest size of a single buffer
-    host: int = 0  # per Gaussian, in the memory of the host
+    host: int = 0  # bytes per Gaussian, in the memory of the host
 
     def required_bytes(self, gaussians: int) -> int:
         """Return the bytes that Gaussians need, including spare capacity for growth and a copy of the largest table."""
@@ -133,7 +133,7 @@ def plan(
     fractions = dict.fromkeys(HARMONICS, visible) if harmonics == "host" else {}
     bytes_by_table = {name: math.ceil(4 * width * fractions.get(name, 1)) for name, width in components.items()}
     sizes = list(bytes_by_table.values())
-    gradients = sum(bytes_by_table[name] for name in PARAMETERS) + 8  # for penalties and edits
+    gradients = sum(bytes_by_table[name] for name in PARAMETERS) + 8  # gradients, for penalties and edits
     motion_bytes = 4 * components[MOTION] + MOVED_GAUSSIAN if MOTION in components else 0
     gaussian_bytes = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + motion_bytes
     fixed_bytes = photographs + FRAME_PIXEL * pixels

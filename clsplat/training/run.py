@@ -52,7 +52,7 @@ class Run:
     status: StatusFile
     model_settings: ModelSettings
     harmonics: Harmonics = "device"  # memory for the bands above 0 in training
-    identity: Identity | None = None  # of the original scene and its photographs
+    identity: Identity | None = None  # hashes of the original scene and its photographs
     file_hashes: dict[str, str] = field(default_factory=dict)  # hashes of the files that settings name, by path
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
     preparation: dict[str, dict[str, Any]] = field(default_factory=dict)  # results of the steps of `prepare:`
@@ -67,18 +67,18 @@ class Run:
     during_index: int = 0  # number of stages in `during` done after that step
     edited: bool = False  # whether the edits due at that step are done
     is_consistent: bool = True  # False after a failure in the middle of an edit of the tables
-    changes: list[str] = field(default_factory=list)  # of settings, on resume
-    image_downscale: float = 1.0  # of the photographs in the step before an edit
+    changes: list[str] = field(default_factory=list)  # changes of settings, on resume
+    image_downscale: float = 1.0  # downscale of the photograph in the step before an edit
     resumed_inputs: str = ""  # `inputs` of the checkpoint that the run resumed from
     scalars: dict[str, float] = field(default_factory=dict)  # state of rules and budgets, by name
     best: Best | None = None  # the best model by validation
-    best_tables: Tables = field(default_factory=dict)  # of the best model, on the host, during the training
+    best_tables: Tables = field(default_factory=dict)  # tables of the best model, on the host, during training
     cache: dict[Any, Any] = field(default_factory=dict)  # measurements of modules, by keys that they choose
     train_seconds: float = 0.0
-    cpu_seconds: float = 0.0  # of all threads of the process, in the same time
+    cpu_seconds: float = 0.0  # CPU time of all threads of the process, in the same time
     model_hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of model files, by path in the run folder
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
-    interrupted: bool = False  # finish the step, save, stop
+    interrupted: bool = False  # whether to finish the step, save, and stop
     on_progress: Callable[[Progress], None] = lambda progress: None
     # called between steps, or items of a long stage; must not change the run
     on_step: Callable[[], None] = lambda: None

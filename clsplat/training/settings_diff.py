@@ -16,7 +16,7 @@ class Difference(NamedTuple):
     key_path: str  # such as stages[1].optimize.rates.quats
     old: Any
     new: Any
-    kind: Kind  # from its class; None: the setting cannot change on resume
+    kind: Kind  # as defined by its class; None: the setting cannot change on resume
 
     def __str__(self) -> str:
         return f"{self.key_path} was {shorten(repr(self.old), 80)}, is {shorten(repr(self.new), 80)}"

@@ -55,7 +55,7 @@ class Stage(Settings):
     needs: ClassVar[frozenset[str]] = frozenset()  # parts of the run that must exist
     makes: ClassVar[frozenset[str]] = frozenset()  # parts that exist afterwards
     removes: ClassVar[frozenset[str]] = frozenset()  # parts that no longer exist afterwards
-    edits: ClassVar[bool] = False  # changes the model; in `during`, it runs between two steps
+    edits: ClassVar[bool] = False  # whether it changes the model; if so, `during` runs it between two steps
 
     stage: str
     """Name of the stage."""

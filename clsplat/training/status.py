@@ -50,7 +50,7 @@ class Status(BaseModel):
     format: Literal[1]
     """Version of this schema; it changes if a key is removed or changes its meaning, not if one is added."""
     state: Literal["starting", "preparing", "running", "done", "failed", "interrupted"]
-    """starting: opens the device; preparing: prepares and reads the scene; running: runs stages; others are final."""
+    """starting: opens the device; preparing: prepares and reads the scene; running: runs stages; the rest are final."""
     stage: str | None = None
     """Current or last stage, or step of `prepare`; for a matrix, the current or last cell."""
     progress: StageProgress | None = None
@@ -154,9 +154,9 @@ class StatusFile:
         self._state_lock, self._write_lock = threading.Lock(), threading.Lock()
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
-        self.seconds: dict[str, float] = {}  # by stage, without nested stages
-        self._nested_seconds = 0.0  # of finished stages nested in the current one
-        self._depth = 0  # of nested stages
+        self.seconds: dict[str, float] = {}  # time of each stage, without nested stages
+        self._nested_seconds = 0.0  # time of finished stages that are nested in the current one
+        self._depth = 0  # number of nested stages
         self._warned = False
 
     def begin(self) -> None:

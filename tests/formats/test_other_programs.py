@@ -192,7 +192,7 @@ def test_invalid_colliders_are_reported(model, tmp_path):
     (tmp_path / "half.ply").write_bytes((tmp_path / "hull.ply").read_bytes()[:-5])
     for name, out, message in (
         ("hull.ply", "b.glb", "b.glb: --collider is only for OpenUSD; use a name that ends in .usdz or .usda"),
-        ("hull.stl", "b.usdz", "hull.stl: expected a mesh as .ply or .obj"),
+        ("hull.stl", "b.usdz", "hull.stl: expected a .ply or .obj mesh"),
         ("none.obj", "b.usdz", "none.obj: cannot be read"),
         ("flat.obj", "b.usdz", "flat.obj: has no faces, or faces without vertices"),
         ("bad.obj", "b.usdz", "bad.obj: could not convert string to float"),

@@ -50,7 +50,7 @@ def test_unremovable_older_checkpoint_stays_and_is_reported(run, locked_names, c
         checkpoint.save(run, keep=1)
     assert names_of(run) == ["step_000001.npz", "step_000002.npz"]
     (record,) = (record for record in caplog.records if "step_000001.npz" in record.getMessage())
-    assert "cannot be removed (in use); it stays" in record.getMessage()
+    assert "cannot be removed (in use); a later save tries again" in record.getMessage()
 
 
 def test_unremovable_failed_state_does_not_hide_the_advice(run, locked_names):

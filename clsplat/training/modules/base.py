@@ -43,7 +43,7 @@ class TrainingStep:
     frame: Frame = field(init=False)
     planes: Planes = field(init=False)  # the photograph and its mask
     image: Array = field(init=False)  # image that the losses compare with the photograph; a module may replace it
-    gradient: Array = field(init=False)  # of the image; each `backward` replaces it with the gradient of its input
+    gradient: Array = field(init=False)  # gradient of the image; each `backward` replaces it with that of its input
     comparison: Comparison = field(init=False)
     transmittance_gradient: Array | None = None  # T dL/dT, [1, rows, stride]
     losses: list[LossValue] = field(default_factory=list)
@@ -96,7 +96,7 @@ class ModuleState:
     is_saved: ClassVar[bool] = True  # whether checkpoints contain the state
 
     def __init__(self) -> None:
-        self.scalars: Scalars = {}  # on the host, by name, with their Adam moments
+        self.scalars: Scalars = {}  # values on the host, by name, with their Adam moments
 
     # checkpoints contain the tables and `scalars`
     def tables(self, full: bool = True) -> Tables:
@@ -117,7 +117,7 @@ class ModuleState:
     def prepare(self, run: Run, last_step: int, is_trained: bool = True) -> None:
         """Prepare for training that ends at global step `last_step`.  is_trained: whether the module learns."""
 
-    # in a step: forward in list order, backward and update in reverse
+    # hooks of a step: forward in list order, backward and update in reverse
     def before_render(self, step: TrainingStep) -> None: ...
     def after_render(self, step: TrainingStep) -> None: ...
     def before_losses(self, step: TrainingStep) -> None: ...

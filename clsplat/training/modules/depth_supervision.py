@@ -31,7 +31,7 @@ class DepthSupervision(TrainingModule):
         if run.scene.tracks is None:
             raise DataError(
                 f"{run.scene.path}: the loss 'inverse_depth' needs points with tracks, as in a COLMAP model; "
-                "remove the loss, or use such a dataset"
+                "remove the loss, or use a COLMAP dataset"
             )
         if self._maps:
             self._maps.require(view.name for view in run.scene.split("train"))

@@ -28,7 +28,7 @@ from clsplat.training.modules.base import ModuleState, Scalars, Tables, Training
 from clsplat.training.run import Run
 
 UPDATES = "updates"
-WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # of the learned tables
+WIDTHS = {"means": 3, "quats": 4, "log_scales": 3, "logit_opacity": 1, "sh_base": 3}  # columns of the learned tables
 NEAR_FRACTION = 0.2  # depth of the near plane, in initial depths
 SIZE, OPACITY = 0.5, 0.05  # initial standard deviation, relative to the spacing of the Gaussians; initial opacity
 GOLDEN_RATIO = (5**0.5 - 1) / 2
@@ -127,7 +127,7 @@ class DistractorsState(ModuleState):
 
     def update(self, step: TrainingStep) -> None:
         if (saved := step.saved_value(self)) and step.view_index is not None:
-            _, (frame, pixel_sums) = saved  # of `backward`
+            _, (frame, pixel_sums) = saved  # by `backward`
             self.adams[self._rows[step.view_index]].update(frame.model, frame, pixel_sums, RATES)
 
 

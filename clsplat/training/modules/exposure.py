@@ -46,7 +46,7 @@ LOG = logging.getLogger("clsplat")
 VIEW_COLORS = "view_colors.json"
 TABLE, HAS_KNOWN = "colors", "known exposures"  # names of scalars; HAS_KNOWN: whether the initial exposures were known
 SUMS = int(constants("colors.cl")["SUMS"])
-NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # of the kernels' arguments
+NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # names of the kernels' arguments
 MIN_VISITS = 400  # visits per photograph; with fewer, Adam with a rate of 2e-3 cannot reach a gain of 1.5
 MAX_RATE = 5e-2
 Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # the size of an Adam step: a gain of 1.6
@@ -60,9 +60,9 @@ MIN_EXPLAINED = 1 / 3
 class ColorReport:
     """The learned colors of the photographs, for side files."""
 
-    matrices: dict[str, Floats]  # by photograph, [3, 4]; for a grid, the mean of its matrices
+    matrices: dict[str, Floats]  # matrix of each photograph, [3, 4]; for a grid, the mean of its matrices
     facts: dict[str, Any]  # for JSON, with `meaning` and `type`
-    arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by the name of their .npy file
+    arrays: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # by file name, .npy
 
 
 class Appearance(TrainingModule):
