@@ -122,7 +122,7 @@ def test_summary_names_missing_photographs(done, tmp_path):
 def test_report_starts_with_images_and_cameras(done, tiny_scene):
     text = (done / "report.html").read_text()
     page = Page(text)
-    titles = ["The worst views", "Photos", "Figures", "Settings"]
+    titles = ["The worst views", "Photos", "Summary", "Settings"]
     places = [text.index(f"<h2>{title}</h2>") for title in titles]
     assert places == sorted(places)
     assert text.count(f"<h1>{tiny_scene.name}</h1>") == 1
