@@ -53,10 +53,11 @@ def render_views(
         if value not in choices:
             raise ConfigError(f"{option}: expected one of {', '.join(choices)}, got '{value}'")
     layers = layer_names(depth, normals, alpha)
-    if scene is None and split == "test" and downscale is None and is_model_alone(Path(model)):
+    if scene is None and split == "test" and is_model_alone(Path(model)):
         target, request = videos.VideoTarget(None, Path(out), format), VideoRequest.parse("fixed", 1, None, None, time)
         extras = videos.VideoExtras(None, layers)
-        return len(videos.make_video(Path(model), None, target, request, extras, device=device)["files"])
+        made = videos.make_video(Path(model), None, target, request, extras, downscale=downscale, device=device)
+        return len(made["files"])
     model_file = ModelFile(Path(model), to_path(scene), device, downscale)
     return model_file.render(split, Path(out), format, layers, time)
 

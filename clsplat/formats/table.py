@@ -242,7 +242,10 @@ def writing_format(path: Path) -> Codec:
     if codec is None or codec.write is None:
         remedy = f"is only written by `{codec.command}`" if codec and codec.command else "can be read but not written"
         fault = f"{codec.name} {remedy}" if codec else f"no format matches the name {quote(path.name)}"
-        raise ConfigError(f"{shorten(str(path))}: {fault}; use a name that ends in {', '.join(endings())}")
+        raise ConfigError(
+            f"{shorten(str(path))}: {fault}; use a name that ends in {', '.join(endings())}; "
+            "`clsplat convert` also writes one page, .html"
+        )
     return codec
 
 

@@ -262,7 +262,11 @@ def convert(
     check_output(sources, out)
     changes = changes or Changes()
     options = writing_options(out, quality, changes)
-    model, matrix = changes.apply_with_matrix(read(sources, changes.sky))
+    model = read(sources, changes.sky)
+    try:
+        model, matrix = changes.apply_with_matrix(model)
+    except DataError as error:
+        raise DataError(f"{', '.join(map(str, sources))}: {error}") from error
     if options.collider:
         vertices, faces = options.collider
         options = replace(options, collider=(vertices @ matrix[:3, :3].T + matrix[:3, 3], faces))

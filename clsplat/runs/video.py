@@ -18,7 +18,7 @@ from clsplat.core.errors import ConfigError, DataError
 from clsplat.core.files import PIPELINE, check_not_run_file, scratch_folder
 from clsplat.core.progress import counted
 from clsplat.formats.splats import Quality
-from clsplat.gaussians.conversion import Changes, convert, writing_options
+from clsplat.gaussians.conversion import Changes, convert
 from clsplat.gaussians.model import Model, load
 from clsplat.nerf.files import is_field
 from clsplat.opencl.device import Device
@@ -99,6 +99,8 @@ def make_video(
     is_alone = scene is None and find_run(model) is None and isinstance(content, Model)
     needs_scene = request.needs_scene or not (request.is_file or is_alone)
     used_scene = _read_scene(model, scene, content, downscale, is_required=needs_scene or extras.side == PHOTOGRAPH)
+    if used_scene is None and downscale is not None:
+        raise ConfigError(f"{model}: --scale is for the images of a scene; use --path and --size WxH, or add --scene")
     origin = used_scene.origin if used_scene else content.origin
     content = content.in_scene(used_scene) if used_scene else content
     plan = plan_video(request, used_scene, content_points(content, used_scene), is_moving(content), origin)
@@ -243,7 +245,8 @@ def view(
 
 def convert_to_page(sources: Sequence[Path], out: Path, changes: Changes, quality: Quality) -> dict[str, Any]:
     """Convert models as `conversion.convert` does, but write a viewer page without a scene.  Raises ClsplatError."""
-    writing_options(out, quality, changes)
+    if quality != "balanced" or changes.collider:
+        raise ConfigError(f"{out}: pages have no --quality and no --collider; omit them")
     with scratch_folder(out) as folder:
         file = folder / f"{out.stem}.ply"
         result = convert(sources, file, changes)

@@ -217,8 +217,8 @@ class ScaleBar:
             first, second = (_parse_end(part.strip(), points) for part in parts)
         except ValueError:
             raise ConfigError(
-                f"--distance {quote(text)}: expected A;B=LENGTH, where A and B are x,y,z, or PHOTO:u,v+PHOTO:u,v, or "
-                "names of points in the control file"
+                f"--distance {quote(text)}: expected A;B=LENGTH with a LENGTH above 0, where A and B are x,y,z, or "
+                "PHOTO:u,v+PHOTO:u,v, or names of points in the control file"
             ) from None
         return cls(text, (first, second), length)
 

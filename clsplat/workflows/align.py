@@ -18,7 +18,7 @@ from clsplat.gaussians.conversion import check_output, solid_means, write_model
 from clsplat.gaussians.model import Model, load, model_path
 from clsplat.runs.model_file import ModelSource, find_run, refuse_field
 from clsplat.runs.state import has_pipeline
-from clsplat.scene.camera_files import write_cameras
+from clsplat.scene.camera_files import IMAGES, write_cameras
 from clsplat.scene.control import GpsPositions, LocatedMark, MarkedPoint, ScaleBar, read_control
 from clsplat.scene.detect import read_scene
 from clsplat.scene.scene import Scene
@@ -239,6 +239,8 @@ def align(
             raise ConfigError(f"{out}: is the input; use another folder")
         alignment = Alignment.solve(inputs, options)
         files = write_cameras(alignment.transform.transform_scene(inputs.scene), out, format_, images)
+        if images == "none":
+            LOG.warning("%s: has no photos, without which no scene can be read; copy them to %s", out, out / IMAGES)
         return {**alignment.data(), "files": [str(file) for file in files]}
     if inputs.model is None:
         raise ConfigError(f"{out}: is the name of a model, and {path} is a scene; use the name of a folder")

@@ -25,7 +25,6 @@ MIN_FRACTION = 1e-4  # of an edge: a vertex closer to an end is at that end, exc
 MIN_PART = 0.01  # of the faces of the largest part; smaller parts are removed
 TAUBIN, ROUNDS = (0.5, -0.53), 20  # Taubin 1995: factors of two steps that together do not shrink; number of rounds
 MORE_FACES = 1.5  # factor on the number of faces to keep, each time a reduction opens a closed surface
-MIN_REDUCED = 1000  # faces: smaller meshes are not reduced
 
 
 def _pad_blocks(values: NDArray[Any], neighbors: NDArray[np.intp], fill: float) -> NDArray[Any]:
@@ -160,16 +159,16 @@ def reduce(mesh: Mesh, keep: float) -> Mesh:
 
     A closed surface stays closed, even if more faces must be kept.  Requires the package fast-simplification.
     """
-    if keep >= 1 or len(mesh.faces) < MIN_REDUCED:
+    keep = max(keep, 4 / len(mesh.faces))  # a tetrahedron is the smallest closed surface
+    if keep >= 1:
         return mesh
     import fast_simplification  # optional
 
-    keep = max(keep, 4 / len(mesh.faces))  # a tetrahedron is the smallest closed surface
     points, faces = fast_simplification.simplify(mesh.vertices, mesh.faces, 1 - keep)
     points = np.asarray(points, np.float64)
     colors = mesh.colors[cKDTree(mesh.vertices).query(points)[1]]
     reduced = split_edges(Mesh(points, np.asarray(faces, np.int64), colors))
-    if mesh.is_closed and not reduced.is_closed:
+    if mesh.is_closed and not (reduced.is_closed and len(reduced.faces) >= 4):
         LOG.warning("with %.3g of its faces, the surface would not stay closed; more faces are kept", keep)
         return reduce(mesh, keep * MORE_FACES)
     return reduced

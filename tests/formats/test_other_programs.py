@@ -76,8 +76,14 @@ def test_page_is_that_of_view(model, tmp_path):
     page = Page((tmp_path / "site" / "b.html").read_text())
     assert page.elements["canvas"] == 2
     assert "origin" in page.text
-    for options in ({"quality": "small"}, {"frames": 3}):
-        with pytest.raises(ConfigError, match=r"c\.html: no format matches the name 'c\.html'; use a name that"):
+    for options, message in (
+        ({"quality": "small"}, "pages have no --quality and no --collider; omit them"),
+        (
+            {"frames": 3},
+            "no format matches the name 'c.html'; use a name that ends in .*`clsplat convert` also writes one ",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=f"c.html: {message}"):
             clsplat.convert(tmp_path / "a.ply", tmp_path / "c.html", **options)
 
 

@@ -58,6 +58,10 @@ def test_path_file_needs_no_scene(few_steps, tiny_scene, tmp_path):
     assert (result["frames"], result["size"]) == (5, [32, 32])
     with pytest.raises(ConfigError, match="does not name its scene"):
         clsplat.render_path(model, video=tmp_path / "a.webm", path="through")
+    with pytest.raises(ConfigError, match="--scale is for the images of a scene; use --path and --size WxH"):
+        clsplat.render_views(model, out=tmp_path, downscale=4)
+    with pytest.raises(ConfigError, match="is the position of the camera; use another point"):
+        clsplat.render_path(model, None, None, path="fixed", position=(0, 0, 1), look_at=(0, 0, 1))
 
 
 def test_path_file_needs_no_photographs_of_the_run(few_steps, tiny_scene, tmp_path, caplog):

@@ -218,7 +218,7 @@ def test_model_and_its_scene_are_leveled_by_the_same_ground(tmp_path):
     ("text", "options", "expected"),
     [
         ("", {}, "expected --level, --distance, --gps, or --control"),
-        ("", {"level": "cameras", "distances": ["A;B"]}, "expected A;B=LENGTH"),
+        ("", {"level": "cameras", "distances": ["A;B"]}, "expected A;B=LENGTH with a LENGTH above 0"),
         ("", {"distances": ["1,2,3;1,2,3=4"]}, "both ends are the same point"),
         ("", {"distances": ["99.png:1,2;1,2,3=4"]}, "no photo is named '99.png'"),
         ("", {"distances": ["00.png:1,2+00.png:1,3;1,2,3=4"]}, "almost the same direction"),

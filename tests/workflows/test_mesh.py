@@ -93,6 +93,8 @@ def test_small_parts_are_removed(sphere):
 def test_reduced_sphere_stays_closed(sphere):
     pytest.importorskip("fast_simplification")
     assert surface.reduce(sphere, 1e-300).is_closed
+    small = surface.reduce(sphere, 200 / len(sphere.faces))
+    assert len(surface.reduce(small, 0.5).faces) == pytest.approx(0.5 * len(small.faces), rel=0.1)
     reduced = surface.reduce(sphere, 0.1)
     assert reduced.is_closed
     assert len(reduced.faces) == pytest.approx(0.1 * len(sphere.faces), rel=0.02)

@@ -137,6 +137,8 @@ class VideoRequest:
             raise ConfigError("a point to look at was given without the position of the camera; add --from X,Y,Z")
         if position is not None and path != "fixed":
             raise ConfigError(f"path {quote(path)}: a camera at a given position is fixed; omit --path")
+        if position is not None and target is not None and tuple(position) == tuple(target):
+            raise ConfigError(f"--look-at {quote(tuple(target))}: is the position of the camera; use another point")
         return cls(
             path,
             None if frames is None else check_frames(frames),
