@@ -22,11 +22,11 @@ class CameraResponse(TrainingModule):
     """Learn vignetting and response curves together with the Gaussians, one set of parameters per camera.
 
     A pixel x of the render becomes f(v x) before the losses.  v = 1 + a q + b q² + c q³ is the falloff of the lens
-    (Goldman and Chen 2005): q is the squared distance from a center, in half diagonals of the image; center_x and
-    center_y are its offset from the principal point.  f is a monotone spline for each channel (Ramsay 1988), f(0) = 0
-    and f(1) = 1.  Its slope is piecewise linear; red_0, red_1, red_3, and red_4 are the logarithms of the slope at 0,
-    1/4, 3/4, and 1, relative to the slope at 1/2.  PPISP (Deutsch et al. 2026) has a similar falloff, but power curves.
-    All parameters start at 0, which is the identity.
+    (Goldman and Chen 2005): q is the squared distance from the center of the falloff, in half diagonals of the image.
+    center_x and center_y are the offset of that center from the principal point.  f is a monotone spline for each
+    channel (Ramsay 1988), f(0) = 0 and f(1) = 1.  Its slope is piecewise linear; red_0, red_1, red_3, and red_4 are
+    the logarithms of the slope at 0, 1/4, 3/4, and 1, relative to the slope at 1/2.  PPISP (Deutsch et al. 2026) has
+    a similar falloff, but power curves.  All parameters start at 0, which is the identity.
 
     Views with the same lens or the same pinhole camera in the dataset share a set.  Test views are evaluated with the
     set of their camera, or with the identity if it has no training photos.  The model and its renders do not change.

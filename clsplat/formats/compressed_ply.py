@@ -29,9 +29,9 @@ from clsplat.formats.splats import (
     sh_coefficients,
 )
 
-CHUNK = 256  # splats
-BITS = (11, 10, 11)  # for x, y, and z
-SH_RANGE = 8.0  # from -4 to 4
+CHUNK = 256  # splats in a chunk
+BITS = (11, 10, 11)  # bits of x, y, and z
+SH_RANGE = 8.0  # size of the range of SH coefficients, from -4 to 4
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 AXES, SCALES, COLORS = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
 _BOUNDS = [f"{bound}_{name}" for group in (AXES, SCALES, COLORS) for bound in ("min", "max") for name in group]

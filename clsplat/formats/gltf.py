@@ -52,13 +52,14 @@ LOG = logging.getLogger("clsplat")
 EXTENSION = "KHR_gaussian_splatting"
 PREFIX = f"{EXTENSION}:"
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|texture)_.*|.*spz.*")  # or without effect
+# extensions that are supported, or have no effect on Gaussians
+SUPPORTED = re.compile(f"{EXTENSION}|KHR_mesh_quantization|KHR_(materials|texture)_.*|.*spz.*")
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_READS = 8  # largest average number of reads per byte; equal columns may share an accessor
 SRGB, LINEAR = "srgb_rec709_display", "lin_rec709_display"
-LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # converts between these axes and those of a PLY
-MAX_NAME = 500  # characters, longest file name, and longest start of a data URI
-MAX_TEXT = 1 << 29  # bytes of a .gltf
+LEFT_UP_FRONT = (-1.0, -1.0, 1.0)  # converts between left, up, front and the axes of a PLY
+MAX_NAME = 500  # characters of the longest file name, and of the longest start of a data URI
+MAX_TEXT = 1 << 29  # bytes of the largest .gltf
 
 
 class Gltf:
@@ -118,7 +119,7 @@ class Gltf:
         splats, _ = decode_spz(self.path, data[start : start + length])
         self.is_mip |= splats.mode == "mip"
         self.spz_bytes += sum(table.nbytes for table in splats.parameters.values())
-        if self.spz_bytes > 4 * max(MAX_RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # as for a single SPZ
+        if self.spz_bytes > 4 * max(MAX_RATIO * sum(map(len, self.files.values())), MIN_LIMIT):  # limit of one SPZ file
             raise DataError(
                 f"{self.path}: its SPZ data decompresses to {self.spz_bytes} bytes, which is too many; export it again"
             )
@@ -310,7 +311,7 @@ FLOAT, BYTE, SHORT = 5126, 5121, 5123  # component types
 KINDS = {np.dtype(c): kind for c, kind in (("<f4", FLOAT), ("u1", BYTE), ("<u2", SHORT), ("<u4", 5125))}
 INDICES = "indices"  # key of a primitive
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-MAX_JSON = 1 << 26  # bytes
+MAX_JSON = 1 << 26  # bytes of the largest JSON chunk of a .glb
 
 
 def looks_like_gltf(data: bytes) -> bool:

@@ -17,7 +17,7 @@ from clsplat.core.files import open_atomic
 
 LOG = logging.getLogger("clsplat")
 EPOCH = (1980, 1, 1, 0, 0, 0)  # time of files in a ZIP, fixed so that the same model gives the same bytes
-MORTON_BITS = 21  # per axis: three fit into 63 bits
+MORTON_BITS = 21  # bits per axis; three axes fit into 63 bits
 _SMALLEST = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the other components, by the index of the largest
 _SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3))
 

@@ -7,7 +7,7 @@ their factors are integers whose products and sums are exact in float32.
 import numpy as np
 from numpy.typing import NDArray
 
-ENTRIES = 256  # values of a codebook
+ENTRIES = 256  # number of values in a codebook
 CODEBOOK_ROUNDS, LLOYD_STEPS, PALETTE_ROUNDS = 4, 8, 10
 BLOCK = 1024  # rows whose distances are in memory at once
 SAMPLE = 8  # training points per palette entry
@@ -63,7 +63,7 @@ class _Cells:
             errors = self.errors(cuts[:-1], cuts[1:])
             loss = self.errors(cuts[:-2], cuts[2:]) - errors[:-1] - errors[1:]
             middle = np.searchsorted(self.sorted_values, self.means(cuts))
-            middle = np.clip(middle, cuts[:-1], cuts[1:])  # clipped for empty cells
+            middle = np.clip(middle, cuts[:-1], cuts[1:])  # an empty cell's mean may be outside of it
             gain = errors - self.errors(cuts[:-1], middle) - self.errors(middle, cuts[1:])
             split = int(gain.argmax())
             loss[max(split - 1, 0) : split + 1] = np.inf  # pairs that include the split cell

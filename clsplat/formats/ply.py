@@ -66,7 +66,7 @@ class Section:
     """One element of a binary PLY file."""
 
     count: int
-    dtype: np.dtype[Any]  # of one row, in the byte order of the file
+    dtype: np.dtype[Any]  # type of one row, in the byte order of the file
     start: int  # offset of its rows, bytes
 
 
@@ -77,10 +77,10 @@ class PlyHeader:
     format: str  # one of ORDERS
     comments: tuple[str, ...]
     count: int
-    dtype: np.dtype[Any]  # of one vertex, in the byte order of the file
+    dtype: np.dtype[Any]  # type of one vertex, in the byte order of the file
     start: int  # offset of the vertices, bytes; in an ascii file, size of the header
-    lines_before: int  # in an ascii file: lines between header and vertices
-    sections: dict[str, Section] = field(default_factory=dict)  # in a binary file: elements before the first list
+    lines_before: int  # number of lines between header and vertices of an ascii file
+    sections: dict[str, Section] = field(default_factory=dict)  # elements of a binary file before the first list
 
 
 @dataclass
@@ -210,8 +210,8 @@ def _list_sections(elements: list[_Element], order: str, start: int) -> dict[str
     return sections
 
 
-RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # comments
-# a mip model, as several programs spell it
+RENDERING, MODE = "clsplat ", "SplatRenderMode: "  # starts of comments
+# comments with which several programs mark a mip model
 MIP = re.compile(r"SplatRenderMode\s*:\s*mip|postshot\.anti_aliasing\s*=\s*1", re.IGNORECASE)
 FILTER = "filter_3D"
 NUMERIC_SETTINGS = ("near", "screen_variance", "compensate", "pixel_box")  # rendering settings with values from 0
@@ -272,7 +272,7 @@ def _encode_rows(parameters: Parameters) -> bytes:
     count, rest_columns = parameters["sh_rest"].shape
     means = parameters["means"]
     blocks = [
-        means.astype("<f8").view("<f4") if means.dtype == np.float64 else means,  # a double in two columns
+        means.astype("<f8").view("<f4") if means.dtype == np.float64 else means,  # a double takes two columns
         np.zeros((count, 3), np.float32),
         parameters["sh_base"],
         reorder_columns(parameters["sh_rest"], rest_columns // 3, 3),
@@ -372,7 +372,7 @@ def _to_parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
         )
     columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_find_degree(path, names)) - 1)))
     parameters = {name: _stack_columns(vertices, columns) for name, columns in columns_by_name.items()}
-    if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, which a float cannot hold
+    if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, for which float32 is too coarse
         exact_means = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
         parameters["means"] = np.where(np.isfinite(parameters["means"]), exact_means, parameters["means"])
     rest = reorder_columns(_stack_columns(vertices, columns), 3, len(columns) // 3)
@@ -396,7 +396,7 @@ def _to_parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
 def _stack_columns(vertices: NDArray[Any], columns: tuple[str, ...]) -> NDArray[np.float32]:
     if not columns:
         return np.zeros((len(vertices), 0), np.float32)
-    with np.errstate(over="ignore"):  # from doubles; infinity is rejected later
+    with np.errstate(over="ignore"):  # large doubles become infinity, which is rejected later
         return np.stack([vertices[c].astype(np.float32) for c in columns], axis=1)
 
 

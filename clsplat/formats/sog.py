@@ -62,7 +62,7 @@ from clsplat.formats.splats import (
 
 META = "meta.json"
 PARTS = ("means", "scales", "quats", "sh0")  # required keys of meta.json; shN is optional
-MAX_META = 1 << 24  # bytes
+MAX_META = 1 << 24  # bytes of the largest meta.json
 MAX_IMAGE = 1 << 30
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 MAX_RATIO = 2  # largest accepted compression ratio of images in a ZIP; they are already compressed
@@ -144,8 +144,8 @@ def open_sog(path: Path) -> Iterator[SogFiles]:
 
 PIXELS_PER_BYTE = 2  # largest accepted number of splats per byte of all images; real files have less than one
 MIN_LIMIT = 1 << 19  # splats that a file of any size may have: 0.1 GB in memory
-PER_ROW = 64  # centroids
-MAX_PALETTE = 1 << 16  # centroids, as labels have 16 bits
+PER_ROW = 64  # centroids in a row of the image
+MAX_PALETTE = 1 << 16  # largest number of centroids; labels have 16 bits
 WIDTHS = {3: 1, 8: 2, 15: 3}  # SH degree by number of coefficients of a centroid
 MAX_NUMBER = 1e30  # largest absolute value in meta.json
 LARGEST_W = 252  # alpha of a quaternion whose largest component is w; 253 to 255 for x, y, z

@@ -143,7 +143,7 @@ def round_sh(rest: Floats, steps: NDArray[np.float32], form: NDArray[np.float64]
     form: the metric to minimize, [K, K], from `visible_form`.
     """
     count = len(form)
-    # with the metric G, (G^-1) reversed = U^T U: row k of U is how later coefficients compensate for an error in k
+    # with the metric G, (G^-1) reversed = U^T U: row k of U corrects an error in k in later coefficients
     inverse = np.linalg.inv(form[::-1, ::-1])
     feedback = np.linalg.cholesky(inverse).T.astype(np.float32)
     feedback /= np.diag(feedback)[:, None].copy()

@@ -102,7 +102,7 @@ def write_splat(path: Path, splats: SplatFile, options: WriteOptions) -> str:
 
 # `.ksplat` of GaussianSplats3D, read only: a header, then sections, each with buckets and splats.
 
-HEADER, SECTION = 4096, 1024  # bytes
+HEADER, SECTION = 4096, 1024  # bytes of the file's header, and of each section's header
 MAX_DEGREE = 2
 SH_RANGE = (-1.5, 1.5)
 RANGE = 32767
@@ -115,7 +115,7 @@ class SplatSection:
     """The header of one section, and the layout of its splats."""
 
     count: int
-    rows: int  # at least `count`
+    rows: int  # number of stored rows, at least `count`
     degree: int
     bucket_size: int
     buckets: int

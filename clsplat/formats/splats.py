@@ -40,7 +40,10 @@ def is_timestamp(time: float) -> bool:
 
 
 def motion_width(degree: int, has_turn: bool) -> int:
-    """Return the number of columns of a motion table.  degree: 1 to 3, of the polynomials; has_turn: with rotations."""
+    """Return the number of columns of a motion table.
+
+    degree: degree of the polynomials, 1 to 3; has_turn: whether Gaussians rotate.
+    """
     return 2 + 3 * degree + TURN * has_turn
 
 
@@ -80,7 +83,7 @@ SH_C0 = 0.28209479177387814  # basis function of band 0
 VARIANCE = 0.3  # px²: screen filter of 3DGS
 NEAR_FRACTION = 0.04  # default near plane, relative to the median distance of the means from their center
 MIP_VARIANCE = 0.1  # px²: screen filter of files that only say `mip` (Yu et al. 2024)
-MAX_FILE = 1 << 33  # bytes
+MAX_FILE = 1 << 33  # bytes of the largest file
 MAX_VALUE = 1e15  # largest absolute value in the tables of BOUNDED; viewers and codebooks fail beyond it
 BOUNDED = ("log_scales", "sh_base", "sh_rest", MOTION)
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
@@ -139,10 +142,10 @@ class ReadOptions:
 class WriteOptions:
     """Options for writing a model."""
 
-    quality: Quality = "balanced"  # for SPZ and SOG
+    quality: Quality = "balanced"  # precision of SPZ and SOG files
     quiet: bool = False  # do not warn about what the format does not store
-    world: bool = False  # positions in world coordinates, instead of an origin
-    collider: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None  # OpenUSD: world vertices, [V, 3]; faces
+    world: bool = False  # write world coordinates, and no origin
+    collider: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None  # for OpenUSD: world vertices, [V, 3]; faces
 
 
 def sh_coefficients(degree: int) -> int:

@@ -175,7 +175,7 @@ def choose_fraction_bits(path: Path, means: NDArray[np.float32], is_fine: bool) 
     Raises DataError if positions do not fit even without fractional bits.
     """
     max_value = float(np.abs(means).max(initial=0))
-    extra_bits = max(0, round(-math.log2(typical_size(means))) - COARSE)  # for models with a large unit of length
+    extra_bits = max(0, round(-math.log2(typical_size(means))) - COARSE)  # positive for a large unit of length
     target_bits = min((FINE_FRACTION if is_fine else FRACTION) + extra_bits, MAX_FRACTION)
     bits = min(target_bits, math.floor(math.log2(MAX_INT24 / max(max_value, 1e-9))))
     if bits < 0:
@@ -465,7 +465,8 @@ def _decode_version_4(path: Path, data: bytes) -> tuple[SpzHeader, Parameters, s
         if unpacked_size != size or length > len(data) - start:
             raise DataError(
                 f"{path}: declares {length} bytes for stream {index}, and {unpacked_size} after decompression; "
-                f"expected {size} decompressed bytes for {header.count} splats, in the file; copy or export it again"
+                f"expected {size} decompressed bytes for {header.count} splats, and a stream inside the file; "
+                "copy or export it again"
             )
         frames.append(ZstdFrame(path, data[start : start + length], size))
         start += length

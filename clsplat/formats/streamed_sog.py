@@ -179,7 +179,7 @@ def _read_splats(path: Path, name: str, ranges: list[RowRange]) -> SplatFile:
         if offset < end or offset + count > len(splats):
             raise DataError(
                 f"{path}: a leaf contains splats {offset} to {offset + count - 1} of {quote(name)}; expected splats "
-                f"from {end}, after those of other leaves, to {len(splats) - 1}; export it again"
+                f"from {end} to {len(splats) - 1}, which no other leaf contains; export it again"
             )
         end = offset + count
         rows.append(np.arange(offset, end))
@@ -188,7 +188,7 @@ def _read_splats(path: Path, name: str, ranges: list[RowRange]) -> SplatFile:
 
 # The tree of a streamed SOG: boxes of the splats of all levels, halved until they are small.
 
-MAX_LOG_SCALE = 80.0  # for boxes, because JSON has no infinity
+MAX_LOG_SCALE = 80.0  # limit for boxes, because JSON has no infinity
 Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
@@ -197,7 +197,7 @@ Rows = NDArray[np.intp]
 class LeafLimits:
     """The limits of a leaf; the defaults are those of PlayCanvas."""
 
-    splats: int = 512 * 1024  # largest number, of all levels; a file exceeds it by one leaf at most
+    splats: int = 512 * 1024  # largest number, counting all levels; a file may exceed it by one leaf
     extent: float = 4.0  # longest side of the box of the means, in typical sizes: 16 scene units for a size of 4
     min_splats: int = 1024  # leaves with no more splats are not split because of their extent
 
@@ -292,7 +292,7 @@ class _FileList:
     """The files of all levels.  Leaves are added to a file until it has more than `splats` splats."""
 
     splats: int
-    rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by name: level, rows of each leaf
+    rows: dict[str, tuple[int, list[Rows]]] = field(default_factory=dict)  # by file name: level, rows of leaves
     next_file: dict[int, int] = field(default_factory=dict)  # by level, the number of the file for the next leaf
 
     def to_json(self, node: Node) -> dict[str, Any]:

@@ -41,7 +41,7 @@ class FileStart:
     """The first bytes of a file, by which its format is detected."""
 
     path: Path
-    data: bytes  # at most MAX_HEADER bytes
+    data: bytes  # start of the file, at most MAX_HEADER bytes
     size: int  # bytes of the file
 
     def parse_ply(self) -> PlyHeader | None:

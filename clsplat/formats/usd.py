@@ -45,7 +45,7 @@ LOG = logging.getLogger("clsplat")
 # Writing.
 
 BLOCK = 4096  # rows formatted at once
-EXTENT = 3.0  # standard deviations around the means
+EXTENT = 3.0  # half the side of a splat's box, in standard deviations
 LAYER = "scene.usda"  # file name in a .usdz
 PADDING = struct.pack("<2H20x", 0x1986, 20)  # aligns the data of LAYER to 64 bytes, as .usdz requires
 MAX_LAYER = 0x7FFFFFFF  # bytes; other programs do not read a ZIP64

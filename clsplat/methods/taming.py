@@ -30,7 +30,7 @@ def pixel_weights(render: RenderedView) -> Floats:
 
 
 def view_scores(survey: Survey, views: int) -> tuple[Floats, Floats]:
-    """Return two sums over sampled views for each Gaussian, [N]: the view's loss, and the Gaussian's terms times it.
+    """Return two sums over sampled views for each Gaussian, [N]: the loss, and the loss times the Gaussian's terms.
 
     Only views in which the Gaussian is visible count.  The terms of a Gaussian are its depth, its radius, and three
     sums over the pixels where it is blended: `pixel_weights`, the number of pixels, and its blend weights.

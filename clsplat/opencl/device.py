@@ -453,7 +453,7 @@ class Kernel:
         return kernel
 
     def __call__(self, *, items: int | tuple[int, ...] = 0, groups: int | tuple[int, ...] = 0, **values: Any) -> None:
-        """Launch `items` work-items, rounded up to full work-groups, or `groups` work-groups; no-op if a size is 0."""
+        """Launch `items` work-items, rounded up to full work-groups, or `groups` work-groups; none if a size is 0."""
         total = items or groups
         size = (total,) if isinstance(total, int) else total
         local = self.group[: len(size)]

@@ -18,7 +18,7 @@ runtimes.prepare()
 import pyopencl as cl  # noqa: E402
 
 T = TypeVar("T")
-MAX_PLANS = 128  # an edit or another image size needs new ones
+MAX_PLANS = 128  # upper bound; an edit or another image size needs new plans
 
 
 @dataclass
@@ -26,10 +26,10 @@ class Launch:
     """One launch of a plan."""
 
     source: Kernel
-    kernel: Any  # of pyopencl; no other launch sets its arguments
+    kernel: Any  # pyopencl kernel; no other launch sets its arguments
     size: tuple[int, ...]
     group: tuple[int, ...]
-    arguments: list[Any]  # numbers, and weak references to buffers: a plan keeps no memory
+    arguments: list[Any]  # numbers, and weak references to buffers, so that a plan keeps no memory alive
 
 
 class Plan:
@@ -110,7 +110,7 @@ def _identity(value: Any) -> Any:
 
 
 class Plans:
-    """The plans of the parts of a step, by key.  Each thread needs its own."""
+    """The plans of the parts of a step, by key.  Each thread needs its own `Plans`."""
 
     def __init__(self, device: Device) -> None:
         self._device = device

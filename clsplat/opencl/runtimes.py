@@ -174,7 +174,7 @@ def probe_fault(key: str, platform: int, device: int) -> str | None:
     """
     content = PROBE.read_bytes() + key.encode()
     record = cache_folder() / "probes" / hashlib.sha256(content).hexdigest()[:16]
-    if os.path.exists(record):  # unlike Path.exists, False in a folder of another user
+    if os.path.exists(record):  # unlike Path.exists, never raises PermissionError
         return None
     remove_broken_kernels()
     fault = _run_probe(platform, device, {})

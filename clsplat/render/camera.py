@@ -12,8 +12,8 @@ from clsplat.render.workspace import Workspace
 from clsplat.scene.view import View
 
 RAY_MARGIN = constants()["RAY_MARGIN"]
-TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # largest number per side
-PIXELS_MAX = 2**30  # of an image in whole tiles: kernels index up to four planes in 32 bits
+TILES_MAX = 1 << int(constants("tiles.h")["BOX_BITS"])  # largest number of tiles per side
+PIXELS_MAX = 2**30  # largest image, in whole tiles: kernels index up to four planes in 32 bits
 
 # camera_t of cl_kernels/common.h
 CAMERA = np.dtype(

@@ -70,7 +70,7 @@ class DistanceField:
 
     blocks: Blocks
     voxel: float  # scene units
-    values: Floats  # [B, SIDE, SIDE, SIDE], in truncations, positive in front; NaN where too few views see the point
+    values: Floats  # [B, SIDE, SIDE, SIDE] distance / truncation, positive in front; NaN if too few views see a point
     colors: NDArray[np.uint8]  # [B, SIDE, SIDE, SIDE, 4] red, green, blue, and 1 where they are known
 
 

@@ -14,7 +14,7 @@ from clsplat.render.workspace import Workspace
 class OverlayLayer:
     """A layer composited over an image; valid until the next call of `composite_layer`."""
 
-    frame: Frame  # of the layer only, over black
+    frame: Frame  # the layer alone, rendered over black
     image: Array  # composite, [3 or 4, rows, stride]
     transmittance_gradient: Array  # T dL/dT of the loss on the layer's alpha, [1, rows, stride]
     loss: Callable[[], float]  # returns the value of that loss; waits for the device

@@ -179,7 +179,7 @@ class Frame:
     image: Array  # [3, rows, stride], zero outside the image; with a fourth plane [4, rows, stride]
     transmittance: Array  # [rows, stride]
     bands: list[Band]  # `lists` belongs to the last one
-    content: Content  # of the planes
+    content: Content  # content of the planes
     model: DeviceModel  # the rendered model; a moving one at the timestamp of the camera
 
     @property
@@ -209,15 +209,15 @@ def pose_gradient(
 
 
 class PixelSums:
-    """Sums over each Gaussian's pixels, which are records of pairs until `array` is read or a kernel sums them."""
+    """Sums over each Gaussian's pixels, stored as records of pairs until `array` is read or a kernel sums them."""
 
     def __init__(self, array: Array, pairs: dict[str, Array], launch: Callable[[], None] | None) -> None:
-        """launch: sums the records of `pairs` into `array`, [count, S]; None if it has their sums."""
+        """launch: sums the records of `pairs` into `array`, [count, S]; None if `array` has the sums."""
         self._array, self._pairs, self._launch = array, pairs, launch
 
     @property
     def array(self) -> Array:
-        """The sums, [count, S]; the records are summed when it is read first."""
+        """The sums, [count, S].  The first access sums the records."""
         if self._launch:
             self._launch()
             self._launch = None
@@ -233,7 +233,7 @@ class RenderLimits:
     """Limits on memory and launches; results do not depend on them."""
 
     pairs: int  # (tile, Gaussian) pairs in memory
-    tiles: int = 0  # per launch; 0: all
+    tiles: int = 0  # tiles per launch; 0: all
 
 
 class Rasterizer:
@@ -323,7 +323,7 @@ class Rasterizer:
     ) -> tuple[Array, Array, Array]:
         """Blend a band; return `tile_last`, the image, and the transmittance.
 
-        splats: their records and lists; prefix: of the names of the image and the transmittance in the workspace.
+        splats: their records and lists; prefix: start of the names of the image and transmittance in the workspace.
         """
         records, lists = splats
 

@@ -69,9 +69,9 @@ Distortion = Callable[..., tuple[Floats, Floats]]  # f(u, v, k), or f(x, y, k, z
 BORDER_POINTS = 200  # points per edge of a photograph
 MAX_ITERATIONS = 50  # iterations of Newton's method
 MAX_ERROR = 1.0e-6  # largest error of the result of Newton's method, normalized units
-MAX_DIFFERENCE = 1.0e-3  # between a ray and its value after distortion and undistortion, normalized units
+MAX_DIFFERENCE = 1.0e-3  # largest error of a ray after distortion and undistortion, normalized units
 MAX_TANGENT = 3**0.5  # tan of 60 degrees: beyond it, a pinhole image is mostly stretched edges
-MAX_GROWTH = 2.0  # size of an undistorted photograph, relative to the original
+MAX_GROWTH = 2.0  # largest side of an undistorted photograph, relative to the original
 
 
 def _radial(u: Floats, v: Floats, k: Sequence[float]) -> tuple[Floats, Floats]:
@@ -167,7 +167,8 @@ WIDE = frozenset(MODELS) - frozenset(PERSPECTIVE)  # models that also cover dire
 
 # Wide photographs: panoramas and fisheyes of about 180 degrees or more are cut into the faces of a cube.
 
-MIN_WIDE = math.radians(80)  # from the optical axis to a side; a pinhole image would be several times as wide
+# beyond MIN_WIDE, a pinhole image would be several times as wide as the photograph
+MIN_WIDE = math.radians(80)  # smallest angle from the optical axis to a side of a wide photograph
 MIN_CIRCLE = math.radians(100)  # a fisheye shows nothing beyond this angle or the angle of its nearest edge
 RIM = 1.5  # px: samples at the edge of a fisheye's circle would mix with the dark pixels around it
 FACE_TANGENT = 1.1  # tan of half the field of view of a face, 95 degrees: faces overlap

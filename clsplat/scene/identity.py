@@ -27,8 +27,8 @@ from clsplat.scene.view import NO_FILE, Floats, Size, View, needs_rotation
 
 # Decode every photograph and mask of a scene before training, so that damaged files are found early.
 
-MAX_THREADS = 8  # each keeps one photograph in memory
-MAX_CACHE_BYTES = 1 << 24  # about 200 000 photographs
+MAX_THREADS = 8  # each thread keeps one photograph in memory
+MAX_CACHE_BYTES = 1 << 24  # bytes, about 200,000 photographs
 MAX_NAMES = 3  # names in a message
 Entry = tuple[int, int, int]  # width, height, and flags as bits: blank, excludes every pixel as a mask, transparent
 

@@ -18,7 +18,7 @@ from clsplat.scene.scene import Scene, every_nth, make_scene
 from clsplat.scene.view import View
 
 POSES_FILE = "poses_bounds.npy"
-MAX_BYTES = 1 << 24  # 136 bytes per image, 120 000 images
+MAX_BYTES = 1 << 24  # 120,000 images of 136 bytes each
 LLFF_TO_OPENCV = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.float64)  # LLFF's axes are (down, right, back)
 logger = logging.getLogger("clsplat")
 

@@ -173,7 +173,7 @@ class FileLookup:
         for i in unmatched:
             candidates_by_rank = defaultdict[tuple[int, ...], list[tuple[PathParts, Path]]](list)
             files = [file for key in _keys(targets[i]) for file in self._files.get(key, ()) if file[1] not in excluded]
-            siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # better matches, and faster
+            siblings = [file for file in files if file[0][-2:-1] == targets[i][-2:-1]]  # better matches, faster to rank
             for parts, path in siblings or files:
                 if rank := self._rank(self.raw_names[i], targets[i], parts, path):
                     candidates_by_rank[rank].append((parts, path))

@@ -32,13 +32,13 @@ class Parts:
     observed: dict[str, int] = field(default_factory=dict)  # number of points that each view observes, if known
     submodels: dict[str, int] = field(default_factory=dict)  # image counts of COLMAP models, the one in use first
     points: PointTable | None = None
-    image_folder: Path | None = None  # contains all images; None: those in `expected_files`
+    image_folder: Path | None = None  # folder of all images; None: use only `expected_files`
     disk_files: list[Path] = field(default_factory=list)  # image files in the folders of the views
     expected_files: list[Path] = field(default_factory=list)  # files that the dataset names
     faults: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)  # about files that `prepare` cannot read
-    hint: str = ""  # about existing files that are similar to missing ones
-    notes: list[str] = field(default_factory=list)  # about files that are not at the paths in the dataset
+    warnings: list[str] = field(default_factory=list)  # warnings about files that `prepare` cannot read
+    hint: str = ""  # hint at existing files that are similar to missing ones
+    notes: list[str] = field(default_factory=list)  # notes about files that are not at the dataset's paths
     scene: Scene | None = None
     refusal: str = ""
 

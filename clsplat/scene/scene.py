@@ -63,7 +63,7 @@ Background = Literal["black", "white"]
 HOLDOUT = 8  # every 8th view is a test view if the dataset has no split: the default of pipelines
 MAX_DISTANCE = 10.0  # times the median distance; cameras reach 2 on a line, 1 on an orbit, and about 4 in a close-up
 MAX_OFFSET = 100  # times the median distance of the points; float32 then resolves 1e-5 of that distance
-MAX_OUTLIERS = 0.2  # fraction of the cameras
+MAX_OUTLIERS = 0.2  # largest fraction of cameras that are outliers
 ROUNDING = 1e-6  # times the largest coordinate; centers that differ by less count as equal
 MAX_THUMBNAILS = 4
 IN_MEMORY = Path("<memory>")  # path of a scene without a dataset
@@ -295,7 +295,7 @@ def format_position(position: Floats) -> str:
 
 
 def camera_extent(views: Sequence[View], points: NDArray[np.floating] | None = None) -> float:
-    """Return the radius of the cameras: 1.1 x the largest distance of a camera from their mean (Kerbl et al. 2023).
+    """Return the radius of the cameras: 1.1 times the largest distance of a camera from their mean (Kerbl et al. 2023).
 
     Outliers are ignored, since one wrong pose would change all sizes and learning rates of the scene.  If all cameras
     have the same center, the result is the median distance of the points from it or, without points, the depth of the

@@ -136,7 +136,7 @@ class Correspondences:
                 f"check their {values}"
             )
         shape = "nearly on a line" if self.up is None else "above each other"
-        remedy = "add --level, or points away from that line" if self.up is None else "add points at other places"
+        remedy = "add --level, or add points away from that line" if self.up is None else "add points at other places"
         raise DataError(
             f"the points are {shape}, up to their errors of {error:.3g}, so they do not determine the rotation; "
             f"{remedy}"

@@ -277,7 +277,7 @@ def read_pose(frame: JsonFrame) -> Floats:
     matrix = frame.array("transform_matrix")
     is_finite = matrix.shape in ((4, 4), (3, 4)) and (np.abs(matrix) < MAX_VALUE).all()
     if is_finite and not _is_rotation(matrix[:3, :3]):
-        matrix[:3, :3] /= np.cbrt(max(np.linalg.det(matrix[:3, :3]), MIN_SCALE**3))  # some exporters keep a scale
+        matrix[:3, :3] /= np.cbrt(max(np.linalg.det(matrix[:3, :3]), MIN_SCALE**3))  # some exporters scale the rotation
     if not is_finite or not _is_rotation(matrix[:3, :3]):
         raise DataError(
             f"{frame.source}: transform_matrix is not a 4x4 matrix whose upper-left 3x3 block is a rotation; "

@@ -66,7 +66,7 @@ class Viewpoint:
 
 
 def _distance_to_show_all(start: View, offsets: NDArray[np.floating]) -> float:
-    """Return the distance from the center at which `start` shows nearly all points, as multiples of TOWARD_START.
+    """Return the distance from the center at which `start` shows nearly all points, in multiples of TOWARD_START.
 
     offsets: the points minus the center, [N, 3].
     """

@@ -77,9 +77,9 @@ class State(BaseModel):
     modules: dict[str, dict[str, float]]  # scalars of training modules, by type
     best: Best | None  # the best model by validation
     train_seconds: Seconds  # wall-clock time of training
-    cpu_seconds: Seconds  # of all threads, in the same time
+    cpu_seconds: Seconds  # CPU time of all threads during `train_seconds`
     metrics: Metrics
-    records: Count  # lines of metrics.jsonl
+    records: Count  # number of lines in metrics.jsonl
     model_hashes: dict[str, str]  # SHA-256 of model files, by path in the run folder
     changes: list[str]
     device: str

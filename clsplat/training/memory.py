@@ -18,11 +18,11 @@ from clsplat.scene.view import View
 
 VISIBLE_FRACTION = 0.5  # fraction of Gaussians visible in one view, an estimate; only their harmonics are on the device
 PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
-FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # records, mean2d; keys and radius; sorting by depth
-MOVED_GAUSSIAN = 4 * (3 + 4 + 1)  # means, quaternions, and logits at the time of a view
-FRAME_PAIR = 4 * (RECORD + 6)  # gradient record; tile and Gaussian of the pair, sorting by tile
+FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # bytes: records, mean2d; keys and radius; sorting by depth
+MOVED_GAUSSIAN = 4 * (3 + 4 + 1)  # bytes: means, quaternions, and logits at the time of a view
+FRAME_PAIR = 4 * (RECORD + 6)  # bytes: gradient record; tile and Gaussian of the pair; sorting by tile
 FRAME_PIXEL = 4 * (4 * 3 + 3 + 9 + 4 + 2)
-# image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; sums of a blur;
+# bytes: image, photograph, gradient, second render; transmittance, texture, mask; SSIM's derivatives; sums of a blur;
 # inverse depths and their gradient
 
 Location = Literal["device", "host"]

@@ -163,7 +163,7 @@ KERNELS = {
     "network backward": "dense_backward",
     "network, weights": "dense_weights dense_biases dense_sums",
     "grid backward": "grid_backward",
-}  # by stage, in the order of a step
+}  # names of the kernels of each stage, in the order of a step
 STAGES = {kernel: stage for stage, kernels in KERNELS.items() for kernel in kernels.split()}
 
 

@@ -40,8 +40,8 @@ class Run:
     """The mutable state of a pipeline run; stages read and change it."""
 
     device: Device
-    scene: Scene  # for training, at one size or several
-    original: Scene  # as read from the dataset, at full size
+    scene: Scene  # the scene for training, at one or several sizes
+    original: Scene  # the scene as read from the dataset, at full size
     out: Path
     name: str
     seed: int
@@ -56,18 +56,18 @@ class Run:
     file_hashes: dict[str, str] = field(default_factory=dict)  # hashes of the files that settings name, by path
     prepared: dict[str, str] | None = None  # hash of the inputs of `prepare:`, and the folder of its result
     preparation: dict[str, dict[str, Any]] = field(default_factory=dict)  # results of the steps of `prepare:`
-    losses: list[Loss] = field(default_factory=list)  # from Python, in addition to those of the pipeline
+    losses: list[Loss] = field(default_factory=list)  # losses from Python, in addition to the pipeline's
     adam: Adam | None = None
     stats: SplatStats | None = None
     modules: dict[str, Any] = field(default_factory=dict)  # states of training modules, by type
-    learned_field: TrainedField | None = None  # trained instead of a model
+    learned_field: TrainedField | None = None  # field that is trained instead of Gaussians
     step: int = 0  # global step that is done or in progress
     stage_index: int = 0  # current stage
-    stage_step: int = 0  # steps done in that stage
+    stage_step: int = 0  # number of steps done in that stage
     during_index: int = 0  # number of stages in `during` done after that step
     edited: bool = False  # whether the edits due at that step are done
     is_consistent: bool = True  # False after a failure in the middle of an edit of the tables
-    changes: list[str] = field(default_factory=list)  # changes of settings, on resume
+    changes: list[str] = field(default_factory=list)  # settings that changed when the run resumed
     image_downscale: float = 1.0  # downscale of the photograph in the step before an edit
     resumed_inputs: str = ""  # `inputs` of the checkpoint that the run resumed from
     scalars: dict[str, float] = field(default_factory=dict)  # state of rules and budgets, by name
@@ -75,7 +75,7 @@ class Run:
     best_tables: Tables = field(default_factory=dict)  # tables of the best model, on the host, during training
     cache: dict[Any, Any] = field(default_factory=dict)  # measurements of modules, by keys that they choose
     train_seconds: float = 0.0
-    cpu_seconds: float = 0.0  # CPU time of all threads of the process, in the same time
+    cpu_seconds: float = 0.0  # CPU time of all threads of the process during `train_seconds`
     model_hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of model files, by path in the run folder
     metrics: dict[str, dict[str, Any]] = field(default_factory=dict)  # split -> downscale -> averages
     interrupted: bool = False  # whether to finish the step, save, and stop

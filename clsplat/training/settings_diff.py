@@ -13,10 +13,10 @@ Kind = Literal["output", "training"] | None
 class Difference(NamedTuple):
     """A setting that differs between two resolved pipelines."""
 
-    key_path: str  # such as stages[1].optimize.rates.quats
+    key_path: str  # path of the setting, such as stages[1].optimize.rates.quats
     old: Any
     new: Any
-    kind: Kind  # as defined by its class; None: the setting cannot change on resume
+    kind: Kind  # kind that its class defines; None: the setting cannot change on resume
 
     def __str__(self) -> str:
         return f"{self.key_path} was {shorten(repr(self.old), 80)}, is {shorten(repr(self.new), 80)}"

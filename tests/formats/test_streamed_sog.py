@@ -278,7 +278,7 @@ WRONG = {
     "a file twice": ({"filenames": ["0_0/meta.json", "0_0//meta.json"]}, "expected distinct file names"),
     "a run twice": (
         {"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 9}}}] * 2}},
-        "other leaves",
+        "no other leaf",
     ),
 }
 

@@ -33,10 +33,10 @@ Scalars = dict[str, float]
 class TrainingStep:
     """The data of one training step.  Each hook sees the changes that earlier hooks made."""
 
-    number: int  # global, from 1
+    number: int  # global step, counted from 1
     rasterizer: Rasterizer
     photograph: Photograph
-    model: DeviceModel  # as rendered in this step
+    model: DeviceModel  # the model that this step renders
     background: Array
     loss_settings: Sequence[Loss]
     transforms: Sequence[PhotographTransform]

@@ -62,7 +62,7 @@ class Distractors(TrainingModule):
         return DistractorsState(self, run.scene.split("train"), rasterizer)
 
     def device_bytes(self, views: Sequence[View], tile: int) -> int:
-        rows = len({view.name for view in views}) * (self.count + 64)  # whole groups
+        rows = len({view.name for view in views}) * (self.count + 64)  # upper bound: each photo has whole groups
         return super().device_bytes(views, tile) + 4 * rows * (3 * sum(WIDTHS.values()) + 1)
 
     @classmethod
@@ -79,7 +79,7 @@ class DistractorsState(ModuleState):
     """The Gaussians of each photograph on the device, with a separate Adam optimizer for each photograph."""
 
     def __init__(self, settings: Distractors, views: Sequence[View], rasterizer: Rasterizer) -> None:
-        """views: the training views; rasterizer: used only here, since its frames share buffers."""
+        """views: the training views; rasterizer: not used elsewhere, since its frames share buffers."""
         super().__init__()
         self.settings, self.rasterizer, self.adams = settings, rasterizer, list[Adam]()
         self._names = list(dict.fromkeys(view.name for view in views))
@@ -127,7 +127,7 @@ class DistractorsState(ModuleState):
 
     def update(self, step: TrainingStep) -> None:
         if (saved := step.saved_value(self)) and step.view_index is not None:
-            _, (frame, pixel_sums) = saved  # by `backward`
+            _, (frame, pixel_sums) = saved  # saved by `backward`
             self.adams[self._rows[step.view_index]].update(frame.model, frame, pixel_sums, RATES)
 
 

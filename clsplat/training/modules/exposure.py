@@ -49,7 +49,7 @@ SUMS = int(constants("colors.cl")["SUMS"])
 NAMES = tuple(f"{y}{c}" for y in "rgb" for c in "rgb1")  # names of the kernels' arguments
 MIN_VISITS = 400  # visits per photograph; with fewer, Adam with a rate of 2e-3 cannot reach a gain of 1.5
 MAX_RATE = 5e-2
-Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # the size of an Adam step: a gain of 1.6
+Rate = Annotated[Schedule, AfterValidator(Bounded(0, maximum=0.5))]  # an Adam step of 0.5 is a gain of 1.6
 RateOrAuto = Annotated[Literal["auto"] | Rate, explain_schedule(", or auto")]
 MIN_SPREAD = 0.03  # accuracy of measurements on tracks
 # In three captures, exposure explains 17 to 31% of the variance; with exposures changed by 25%, 40 to 71%.
