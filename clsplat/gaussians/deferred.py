@@ -47,7 +47,7 @@ class DeferredHarmonics:
         """Return a table from `names`, [components, S], without applying deferred updates."""
         return self.gaussians.tables[name].array
 
-    def catch_up(self, depth_key: Array) -> None:
+    def flush_visible(self, depth_key: Array) -> None:
         """Apply the deferred updates of visible blocks.  depth_key: [S], all bits set for culled Gaussians."""
         if self.updates:
             self._replay(depth_key, every=0)
@@ -75,7 +75,7 @@ class DeferredHarmonics:
     def record(self, depth_key: Array, factors: tuple[float, float]) -> None:
         """Record an update that has already been applied to visible blocks.
 
-        factors: rate and correction2 of adam.h.  `catch_up` must have been called before, with the same keys.
+        factors: rate and correction2 of adam.h.  `flush_visible` must have been called before, with the same keys.
         """
         self.gaussians.device.program("deferred.cl").note_update(
             items=-(-self.gaussians.count // self._lanes),

@@ -17,7 +17,7 @@ class DeferredUpdates(Protocol):
     names: ClassVar[tuple[str, ...]]
     updates: int
 
-    def catch_up(self, depth_key: Array) -> None:
+    def flush_visible(self, depth_key: Array) -> None:
         """Apply the deferred updates of visible rows."""
 
     def flush(self) -> None:

@@ -139,7 +139,7 @@ def project(
     return ProjectedSplats(splats, radius, footprints)
 
 
-def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> None:
+def update_visible_harmonics(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> None:
     """Apply the deferred updates of Gaussians in the view, and fetch their harmonics from the host.
 
     A projection without harmonics determines which Gaussians are in the view.
@@ -153,7 +153,7 @@ def catch_up(workspace: Workspace, model: DeviceModel, camera: DeviceCamera) -> 
         if on_host:
             on_host.upload_visible(depth_key)
         if deferred:
-            deferred.catch_up(depth_key)
+            deferred.flush_visible(depth_key)
 
 
 PIXEL_SUMS = int(constants()["PIXEL_SUMS"])
@@ -276,7 +276,7 @@ class Rasterizer:
         """Render the model like `forward` without waiting; `is_complete` returns whether the frame is valid."""
         sky = model.sky if content != "depth" else None
         model = evaluate_motion(self.workspace, model, camera)
-        catch_up(self.workspace, model, camera)
+        update_visible_harmonics(self.workspace, model, camera)
         while True:
             try:
                 frame = self._forward(model, camera, self._black if sky else background, content)

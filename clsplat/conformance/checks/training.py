@@ -300,7 +300,7 @@ def train(
         planes[:, : gaussians.count] = gradient.T
         loss_gradients["sh_rest"].set(planes)
         if deferred:
-            deferred.catch_up(view_frame.depth_key)
+            deferred.flush_visible(view_frame.depth_key)
         excluded_names = set(gaussians.trained) - {"sh_rest"}
         adam.step(model, view_frame, loss_gradients, Rates().at(step, extent=2.0), excluded_names, rows)
     return {name: gaussians.get(name) for name in DeferredHarmonics.names}
