@@ -90,7 +90,7 @@ def test_failing_expansion_loses_neither_model_nor_features(matches, tmp_path, m
     figures = map_cameras(matches, tmp_path, attempts=3 if step == "expand_pairs" else 4)
     assert figures["registered"] >= 7
     assert f"skipping a failed attempt: {error}" in caplog.text
-    assert [text for text in caplog.messages if text.endswith("trying again with denser features")]
+    assert [text for text in caplog.messages if text.endswith("retrying with denser features")]
 
 
 def test_expansion_registers_a_photograph_after_a_kill(matches, tmp_path, caplog):
