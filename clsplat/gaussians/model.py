@@ -407,5 +407,5 @@ def load(path: str | Path, options: ReadOptions | None = None) -> Model:
         try:
             model = model.transformed(scale, rotation, shift)
         except ValueError as error:
-            raise DataError(f"{path}: the transform of a node is not supported: {error}") from error
+            raise DataError(f"{path}: the transform of a node is not supported ({error}); apply it") from error
     return replace(model, origin=origin) if origin.any() else model

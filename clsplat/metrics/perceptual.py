@@ -47,7 +47,9 @@ class Lpips:
                 "write one with clsplat data lpips"
             ) from error
         if (distance := self.distance(gray, gray)) != 0:
-            raise ConfigError(f"{path}: not an LPIPS network; the distance of equal images is {distance:g}, not 0")
+            raise ConfigError(
+                f"{path}: not LPIPS: equal images have distance {distance:g}; write it with clsplat data lpips"
+            )
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
         """Return the distance of two images, [height, width, 3].  Raises ConfigError if the network rejects them."""

@@ -62,7 +62,7 @@ def find(name: str) -> Path:
     if path.suffix in (".yaml", ".yml"):
         if origin(path) != path:
             return path
-        raise ConfigError(f"{path}: no such pipeline file")
+        raise ConfigError(f"{path}: no such pipeline file; `clsplat pipelines` lists pipelines by name")
     files = shipped_pipelines()
     if name in files:
         return files[name]

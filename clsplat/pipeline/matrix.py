@@ -84,7 +84,7 @@ class Matrix(Settings):
             raise ValueError("expected at least one of pipelines, scenes, seeds, and set")
         for key, axis in axes.items():
             if len({json.dumps(value) for value in axis}) < len(axis):
-                raise ValueError(f"duplicate value in {quote(axis)} of '{key}'")
+                raise ValueError(f"duplicate value in {quote(axis)} of '{key}'; list each value once")
         return self
 
 

@@ -88,7 +88,7 @@ def _expect_measures(pipeline: Pipeline, names: Sequence[str]) -> tuple[Measures
     try:
         return expect_measures(pipeline, names), []
     except DataError as error:
-        return None, [f"  photos         if all {len(names)} photos get a camera, the run is refused: {error}"]
+        return None, [f"  photos         even if all {len(names)} photos get a camera, the run is refused: {error}"]
 
 
 def check_unused(out: Path) -> None:

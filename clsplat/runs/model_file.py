@@ -381,7 +381,7 @@ class ModelFile:
             require_motion(is_moving(self.host_model))
             views = [replace(view, time=times[0]) for view in views]
         if not views:
-            raise DataError(f"{self.scene.path}: has no {split} views")
+            raise DataError(f"{self.scene.path}: has no {split} views; use another --split")
         images = [view.image_path for split in ("train", "test") for view in self.photographs.split(split)]
         return len(write_renders(Canvas(self.painter), views, out, file_format, layers, images))
 

@@ -85,7 +85,7 @@ class RunScene:
         if blank := require_content(scene.path, original.split("train"), files):
             count = pluralize(len(blank), "photo")
             LOG.warning(
-                "%s: found %s without content (black, of a single color, or transparent): %s",
+                "%s: found %s without content (black, of a single color, or transparent): %s; export or remove them",
                 scene.path,
                 count,
                 first_few(blank),

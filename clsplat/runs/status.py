@@ -75,7 +75,7 @@ def format_status(status: dict[str, Any]) -> str:
         lines.append(f"no heartbeat for {status['silent']} s{_describe_process(status)}")
     if status.get("ahead"):
         lines.append(
-            f"its clock is {status['ahead']} s ahead{_describe_process(status)}; whether the run continues is unknown"
+            f"its machine's clock is {status['ahead']} s ahead{_describe_process(status)}; the run may have ended"
         )
     if status.get("message"):
         lines.append(status["message"])

@@ -215,7 +215,7 @@ class Init(Stage):
         assert self.file is not None  # as `check` requires
         parameters = load(Path(self.file)).with_origin(scene.origin).tables()
         if not len(parameters["means"]):
-            raise DataError(f"{self.file}: the model has no Gaussians to start from")
+            raise DataError(f"{self.file}: the model has no Gaussians to start from; use another file")
         return parameters
 
     @staticmethod

@@ -234,7 +234,7 @@ MORE_METRICS = {  # of clsplat/metrics/views.py: name and unit
     "psnr_other_moments": ("PSNR at other timestamps", "dB"),
     "psnr_static": ("PSNR of static pixels", "dB"),
     "flicker": ("flicker of static pixels", "levels"),
-    "flicker_photographs": ("flicker of the photos there", "levels"),
+    "flicker_photographs": ("flicker of static pixels in the photos", "levels"),
 }
 
 

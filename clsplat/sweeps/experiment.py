@@ -139,7 +139,7 @@ class Job:
         overrides = with_scene_path(overrides, scene)
         experiment = load_experiment(pipeline, overrides, execution)
         if experiment is None and execution is not None:
-            raise ConfigError(f"{pipeline}: is a single run; --on is for a file with `matrix:`")
+            raise ConfigError(f"{pipeline}: is a single run, and --on is for a file with `matrix:`; omit --on")
         if experiment and state and start == "resume" and execution is None and state.phase is not Phase.DONE:
             previous, current = state.status.get("store"), STORE if experiment.execution.has_store else None
             if previous not in (None, current):

@@ -96,7 +96,7 @@ class AlignInput:
         expected_up = up_direction(self.scene.views) if self.scene else UP
         candidates = [self.scene.points.positions] if self.scene and self.scene.points else []
         candidates += [solid_means(self.model)] if self.model is not None else []
-        error = DataError("has no points to find the ground in; use --level cameras")
+        error = DataError("has no points, so the ground cannot be found; use --level cameras")
         for points in candidates:  # first the points of the scene, so that a run's model is leveled like its cameras
             try:
                 up, height = ground_plane(points, expected_up)

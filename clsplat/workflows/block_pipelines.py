@@ -26,8 +26,8 @@ def require_divisible(pipeline: Pipeline) -> None:
     optimize_stages = [stage for stage in pipeline.stages if isinstance(stage, Optimize)]
     modules = [module for stage in optimize_stages for module in stage.modules if "blocks" in module.conflicts]
     faults = {
-        "prepare": (settings.prepare, "run it first and give its run folder as --scene"),
-        "adapt": (settings.adapt, "each block would adapt them to its own photos; set them explicitly"),
+        "prepare": (settings.prepare, "run these steps first, and pass their run folder as --scene"),
+        "adapt": (settings.adapt, "each block would adapt its settings to its photos; write the settings explicitly"),
         "model.time": (settings.model.time, "moving Gaussians leave their cells; leave it out"),
         "model.background": (settings.model.background, "each block would learn its own sky; leave it out"),
         "scene.levels": (settings.scene.levels > 1, "a block uses views of one size; set it to 1"),

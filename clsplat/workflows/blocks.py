@@ -122,7 +122,7 @@ class Blocks:
     ) -> None:
         """execution: where blocks are trained; by default one after another in this process."""
         if execution is not None and not execution.has_store:
-            raise ConfigError("--on: blocks need a store; add the key `store` to that file, or use another engine")
+            raise ConfigError("--on: blocks need a store; add `store` to the file of --on, or use another engine")
         self.out, self.plan, self.execution = out, plan, execution
         self._device_name = device if isinstance(device, str) else None
         overrides = [f"scene.path={path_setting(photo_folder(scene))}"]
@@ -207,7 +207,7 @@ class Blocks:
         if failures:
             remedy = "fix the cause and run the same command again; finished blocks are kept"
             coarse = shell_quote(self.out / COARSE)
-            other_settings = f"other settings need another --out; --coarse {coarse} reuses the coarse model"
+            other_settings = f"for other settings, use another --out; --coarse {coarse} reuses the coarse model"
             summary = failures.summary(len(pipelines))
             error = ClsplatError(f"{summary}; {remedy if self.coarse_file else f'{remedy}; {other_settings}'}")
             error.exit_code = summary.exit_code

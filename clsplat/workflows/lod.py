@@ -125,7 +125,7 @@ def build_levels(
     require_free(folder)
     photo_model, gaussians = _open_model(model, scene, plan, device)
     if not len(gaussians):
-        raise DataError(f"{model}: the model has no Gaussians to merge")
+        raise DataError(f"{model}: the model has no Gaussians to merge; export it again")
     require_static(model, gaussians.to_splat_file(), "SOG")
     require_in_range(model, gaussians.to_splat_file(), "SOG")
     if len(gaussians) < MIN_GAUSSIANS:

@@ -123,7 +123,7 @@ def test_unchanged_speed_gets_no_remark():
 
 
 def test_another_device_is_named():
-    assert "  on another device: 'a chip'" in compare_conditions(measurement(device="another"), measurement())
+    assert "  measured on another device: 'a chip'" in compare_conditions(measurement(device="another"), measurement())
 
 
 def test_slower_machine_is_reported():
@@ -133,7 +133,8 @@ def test_slower_machine_is_reported():
 
 
 def test_unmeasured_scene_is_reported():
-    assert "  scenes: A, without B" in compare_conditions(measurement(scenes={"A": TIMES, "B": TIMES}), measurement())
+    lines = compare_conditions(measurement(scenes={"A": TIMES, "B": TIMES}), measurement())
+    assert "  scenes: A; missing: B" in lines
 
 
 def test_table_in_text_is_plain_and_never_cut(monkeypatch):

@@ -77,7 +77,7 @@ def compare_conditions(new: dict[str, Any], earlier: dict[str, Any]) -> list[str
         changes = ", ".join(f"{ratio:.2f} of its {unit}" for unit, ratio in ratios.items())
         lines.append(f"  the device now reaches {changes}; compare the ratios to the floors instead of times")
     if missing_names := [name for name in new["scenes"] if name not in earlier["scenes"]]:
-        lines.append(f"  scenes: {', '.join(earlier['scenes']) or 'none'}, without {', '.join(missing_names)}")
+        lines.append(f"  scenes: {', '.join(earlier['scenes']) or 'none'}; missing: {', '.join(missing_names)}")
     return lines
 
 

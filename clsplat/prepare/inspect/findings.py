@@ -71,7 +71,7 @@ def _check_capture(facts: Facts, readable_count: int) -> Iterator[Finding]:
         is_all_blank = len(blank) == readable_count
         blank_text = f"{_count_with_verb(len(blank), 'photo')} black or of a single color"
         fault = "all photos are blank" if is_all_blank else blank_text
-        yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", "export or take them again")
+        yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", "export or retake them")
 
 
 MAX_NAMES = 4  # names in a finding

@@ -62,7 +62,7 @@ def _draw_points_per_view(inspection: Inspection) -> tuple[list[Markup], list[tu
     if not counts:
         return None
     lowest = sorted(counts.items(), key=lambda item: item[1])[:MAX_VIEWS]
-    return mark_charts_safe([histogram("views by their number of points", list(counts.values()))]), lowest
+    return mark_charts_safe([histogram("number of points per view", list(counts.values()))]), lowest
 
 
 def _name_lists(inspection: Inspection) -> list[tuple[str, list[str], int]]:

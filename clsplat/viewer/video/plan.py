@@ -136,7 +136,7 @@ class VideoRequest:
         if position is None and target is not None:
             raise ConfigError("a point to look at was given without the position of the camera; add --from X,Y,Z")
         if position is not None and path != "fixed":
-            raise ConfigError(f"path {quote(path)}: a camera at a given position is fixed; omit --path")
+            raise ConfigError(f"path {quote(path)}: a camera with a given position does not follow a path; omit --path")
         if position is not None and target is not None and tuple(position) == tuple(target):
             raise ConfigError(f"--look-at {quote(tuple(target))}: is the position of the camera; use another point")
         return cls(
