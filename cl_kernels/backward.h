@@ -111,7 +111,7 @@ typedef struct {
     VI touched;      // whether the Gaussian is visible; if not, all gradients are zero and these values are invalid
     VF mean2d[2];    // px^-1
     VF means[3], quats[4], log_scales[3], logit_opacity;
-    VF focal;        // of the logarithm of a factor on both focal lengths
+    VF focal;        // gradient of the logarithm of a factor on both focal lengths
     VF basis[16], color[3];
 } gradient_t;
 

@@ -6,9 +6,9 @@
 #define BATCH PIXELS  // splats in local memory: each item loads one
 #define STATE (4 + INVERSE_DEPTH)  // floats of a pixel in front of a bucket: transmittance, color, inverse depth
 #if INVERSE_DEPTH
-#define QUADS 4       // of four floats: the full splat record
+#define QUADS 4       // groups of four floats: the full splat record
 #else
-#define QUADS 3       // of four floats: the part of a splat record that blending reads
+#define QUADS 3       // groups of four floats: the part of a splat record that blending reads
 #endif
 
 /* Load a record in aligned quads.  With three quads, the last field is SPLAT_POWER_MIN (BOX_TURNED with PIXEL_BOX)
@@ -84,8 +84,8 @@ void blend_forward(
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
     __global uint *restrict bucket_tile,        // [capacity/BUCKET+1] tile of the pair at each multiple of BUCKET
-    __global float *restrict states,            // [capacity/BUCKET+1,STATE,PIXELS] in front of buckets
-    const uint first_tile)                      // of the launch
+    __global float *restrict states,            // [capacity/BUCKET+1,STATE,PIXELS] states in front of buckets
+    const uint first_tile)                      // first tile of the launch
 {
     __local float4 batch[BATCH][QUADS];
     __local uint open;  // pixels of the tile that are not finished
@@ -194,7 +194,7 @@ void blend_backward(
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
     __global const uint *restrict bucket_tile,  // [capacity/BUCKET+1]
     __global const float *restrict states,      // [capacity/BUCKET+1,STATE,PIXELS]
-    const uint first_tile,                      // of the launch; from end_tile on, buckets
+    const uint first_tile,                      // first tile of the launch; from end_tile on, buckets
     const uint end_tile)
 {
     __local grad_pixels_t pixels[PIXELS];

@@ -25,7 +25,7 @@ void blend_forward(
     __global float *restrict image,             // [3 + INVERSE_DEPTH,tiles_y*TILE,tiles_x*TILE]
     __global float *restrict transmittance,     // [tiles_y*TILE,tiles_x*TILE]
     __global uint *restrict tile_last,          // [T] pairs of the tile up to the last that any pixel blends
-    const uint first_tile)                      // of the launch
+    const uint first_tile)                      // first tile of the launch
 {
     const uint tile = first_tile + get_global_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
@@ -185,7 +185,7 @@ void blend_backward(
     __global const float *restrict behind,      // [tiles_y*TILE,tiles_x*TILE] T dL/dT, read where GRAD_BEHIND
     __global const uint *restrict tile_last,    // [T]
     __global float *restrict pair_sums,         // [P,RECORD] in emission order
-    const uint first_tile)                      // of the launch
+    const uint first_tile)                      // first tile of the launch
 {
     const uint tile = first_tile + get_global_id(0);
     const uint tile_y = tile / camera->tiles_x, tile_x = tile - tile_y * camera->tiles_x;
@@ -223,7 +223,7 @@ void blend_backward(
         const uint length = last - begin < SEGMENT ? last - begin : SEGMENT;
         float16 segment[SEGMENT];
         uint pairs[SEGMENT];
-        for (uint j = 0; j < length; j++) {  // in one loop, so that waits for memory overlap
+        for (uint j = 0; j < length; j++) {  // all loads in one loop, so that waits for memory overlap
             pairs[j] = tile_pairs[begin + j];
             segment[j] = records[pair_splat[pairs[j]]];
         }

@@ -3,7 +3,7 @@
  * The products of a point are summed in the order of its components.  No local memory.  Deterministic. */
 #include "lanes.h"
 
-#define FARTHEST 3.0e38f  // beyond all products
+#define FARTHEST 3.0e38f  // larger than all products
 #define TOGETHER 8        // vectors that an item compares with its points at once, in registers
 
 /* Compare points with the vectors from `first` to `end`, which must fit in a cache.  Among vectors with equal products,

@@ -104,7 +104,7 @@ void color_grid_forward(
     __global const float *restrict image,   // [channels,H',stride] 3 or 4 channels
     __global const float *restrict values,  // [photographs,ENTRIES,nz,ny,nx]
     __global float *restrict colored,       // [channels,H',stride]
-    const uint first,                       // value of the photograph
+    const uint first,                       // index of the photograph's first value
     const uint nx,
     const uint ny,
     const uint nz,
@@ -139,10 +139,10 @@ __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_backward(
     __global const float *restrict image,     // [channels,H',stride] before the transform
     __global const float *restrict values,    // [photographs,ENTRIES,nz,ny,nx]
-    __global const float *restrict gradient,  // [channels,H',stride] of the transformed image, zero outside the image
+    __global const float *restrict gradient,  // [channels,H',stride] dL/d(transformed image), zero outside
     __global float *restrict grad_image,      // [channels,H',stride]
     __global float *restrict passed,          // [3,H',stride] the gradient where nothing is clamped
-    const uint first,                         // value of the photograph
+    const uint first,                         // index of the photograph's first value
     const uint nx,
     const uint ny,
     const uint nz,
@@ -189,7 +189,7 @@ void color_grid_backward(
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void color_grid_row_sums(
     __global const float *restrict image,   // [3 or 4,H',stride] before the transform
-    __global const float *restrict passed,  // [3,H',stride] of color_grid_backward
+    __global const float *restrict passed,  // [3,H',stride] result of color_grid_backward
     __global float *restrict row_sums,      // [ENTRIES,nz,nx,H']
     const uint nx,
     const uint nz,

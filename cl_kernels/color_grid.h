@@ -3,7 +3,7 @@
 #ifndef CLSPLAT_COLOR_GRID_H
 #define CLSPLAT_COLOR_GRID_H
 
-#define ENTRIES 12     // of a matrix [E | b], row by row
-#define MOST_NODES 16  // along an axis
+#define ENTRIES 12     // entries of a matrix [E | b], row by row
+#define MOST_NODES 16  // largest number of nodes along an axis
 
 #endif

@@ -16,7 +16,7 @@ void color_grid_smoothness(
     __global const float *restrict values,    // [photographs,ENTRIES,nz,ny,nx]
     __global float *restrict grad_smoothness,   // [ENTRIES,nz,ny,nx]
     __global float *restrict terms,           // [ENTRIES,nz,ny,nx]
-    const uint first,                         // value of the photograph
+    const uint first,                         // index of the photograph's first value
     const uint nx,
     const uint ny,
     const uint nz,
@@ -51,7 +51,7 @@ void color_grid_update(
     __global float *restrict values,               // [photographs,ENTRIES,nz,ny,nx]
     __global float *restrict moment1,              // [photographs,ENTRIES,nz,ny,nx]
     __global float *restrict moment2,              // [photographs,ENTRIES,nz,ny,nx]
-    const uint first,                              // value of the photograph
+    const uint first,                              // index of the photograph's first value
     const float rate,                              // learning rate / (1 - BETA1^t)
     const float correction2,                       // 1 / (1 - BETA2^t)
     const uint count)                              // ENTRIES * nz * ny * nx

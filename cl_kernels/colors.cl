@@ -41,7 +41,7 @@ void colors_forward(
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void colors_backward(
     __global const float *restrict image,     // [channels,H',stride] before the transform
-    __global const float *restrict gradient,  // [channels,H',stride] of the transformed image, zero outside
+    __global const float *restrict gradient,  // [channels,H',stride] dL/d(transformed image), zero outside
     __global float *restrict grad_image,      // [channels,H',stride]
     __global float *restrict row_sums,        // [SUMS,H']
     const float rr, const float rg, const float rb, const float r1,

@@ -10,7 +10,7 @@
  * One item = one ray.  No local memory. */
 #include "layers.h"
 
-#define DENSITY_BIAS (-1.0f)   // of the released code, which starts with nearly empty space
+#define DENSITY_BIAS (-1.0f)   // value of the released code, which starts with nearly empty space
 #define COLOR_PADDING 0.001f  // lets colors reach 0 and 1
 #define FLUSH_BELOW 1.0e-30f
 #define COLOR_ROWS 4          // rows of the network's colors, and of its densities: one block (layers.h)

@@ -17,7 +17,7 @@ void replay_updates(
     __global float *restrict moment1,         // [components,S] as values
     __global float *restrict moment2,         // [components,S] as values
     __global const uint *restrict sh_slot,    // [S/LANES] slots.h
-    __global const uint *restrict depth_key,  // [S] of the view: all ones when culled; one vector where `every`
+    __global const uint *restrict depth_key,  // [S] the view's: all ones when culled; one vector where `every`
     __global const float *restrict factors,   // [updates,2]
     __global uint *restrict done,             // [S/LANES] number of updates of the list that a block has had
     const uint every,
@@ -51,7 +51,7 @@ void replay_updates(
 /* Append an update to the list, and mark it as done for the blocks with a Gaussian that the view shows. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void note_update(
-    __global const uint *restrict depth_key,  // [S] of the view: all ones when culled
+    __global const uint *restrict depth_key,  // [S] the view's: all ones when culled
     __global float *restrict factors,         // [updates,2]
     __global uint *restrict done,             // [S/LANES]
     const float rate,                         // learning rate / (1 - BETA1^t)

@@ -125,7 +125,7 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void dense_biases(
     __global const float *restrict grad_outputs,  // [T,output_rows,SAMPLES]
     __global float *restrict partials,          // [chunks,P]
-    const uint first_parameter,                 // of the biases
+    const uint first_parameter,                 // index of the first bias
     const uint parameter_count,                 // P
     const uint output_rows,
     const uint output_count,

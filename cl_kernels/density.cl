@@ -144,15 +144,15 @@ void mark_rule(
     __global const float *restrict log_scales,     // [3,S] log of scene units
     __global const float *restrict logit_opacity,  // [S]
     __global const float *restrict statistic,      // [S] sum over views
-    __global const float *restrict divisor,        // [S] of the mean: views, or another sum
+    __global const float *restrict divisor,        // [S] divisor of the sum: views, or another sum
     __global uint *restrict copies,                // [N]
     __global uint *restrict old_rows,              // [N]
     __global float *restrict shrink,               // [N]
     __global uint *restrict shared,                // [N] 0 or 1
-    const float gradient_above,                    // mean of the statistic, at least
-    const float size_above,                        // scene units, more than
-    const float size_below,                        // scene units, at most
-    const float opacity_below,                     // less than
+    const float gradient_above,                    // lower bound of the mean, inclusive
+    const float size_above,                        // lower bound of the size, exclusive, scene units
+    const float size_below,                        // upper bound of the size, inclusive, scene units
+    const float opacity_below,                     // upper bound of the opacity, exclusive
     const float new_shrink,
     const uint new_copies,
     const uint new_old_rows,
@@ -270,7 +270,7 @@ void cap_opacity(
     __global const float *restrict log_scales,       // [3,S] log of scene units
     __global const float *restrict filter_variance,  // [S] scene units^2
     __global float *restrict logit_opacity,          // [S]
-    const float limit,                               // of the filtered opacity
+    const float limit,                               // largest filtered opacity
     const uint stride,
     const uint count)
 {

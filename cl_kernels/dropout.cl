@@ -10,8 +10,8 @@ void draw_left_out(
     __global const float *restrict hidden,  // [planes,S] integers: bits of the views that hide a Gaussian
     __global float *restrict left_out,      // [S] 0 or 1
     const uint below,                       // probability times 2^32
-    const uint hidden_plane,                // of the view
-    const uint hidden_bit,                  // of the view; 0: no Gaussian is hidden
+    const uint hidden_plane,                // plane of the view's bit in `hidden`
+    const uint hidden_bit,                  // the view's bit; 0: no Gaussian is hidden
     const uint seed,
     const uint step,
     const uint stride,

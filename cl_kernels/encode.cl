@@ -41,7 +41,7 @@ void encode_frustums(
     __global const float *restrict cones,  // [rays,RAY_VALUES_READ]
     __global const float *restrict edges,  // [rays,samples + 1]
     __global float *restrict features,     // [T,rows,SAMPLES] from first_row on
-    const uint samples,                    // of a ray: a multiple of LANES
+    const uint samples,                    // samples of a ray: a multiple of LANES
     const uint degrees,
     const uint rows,
     const uint first_row,
@@ -79,7 +79,7 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void encode_directions(
     __global const float *restrict cones,  // [rays,RAY_VALUES_READ]
     __global float *restrict features,     // [T,rows,SAMPLES] from first_row on
-    const uint samples,                    // of a ray: a multiple of LANES
+    const uint samples,                    // samples of a ray: a multiple of LANES
     const uint degrees,
     const uint rows,
     const uint first_row,

@@ -10,12 +10,12 @@
 #define CLSPLAT_FRUSTUM_H
 #include "lanes.h"
 
-#define RAY_VALUES_READ 8  // of a ray, as rays.cl writes them: o, d, radius of the cone, |d|
+#define RAY_VALUES_READ 8  // values of a ray, as rays.cl writes them: o, d, radius of the cone, |d|
 
 typedef struct {
-    VF distance;  // of the mean
+    VF distance;  // distance of the mean
     VF along;     // variance along the ray, in squares of the distance
-    VF across;    // variance across it, in squares of scene units
+    VF across;    // variance across the ray, in squares of scene units
 } frustum_t;
 
 /* The distribution of LANES samples of one ray between the edges t0 and t1. */

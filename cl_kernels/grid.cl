@@ -14,9 +14,9 @@
 #include "frustum.h"
 #include "layers.h"
 
-#define GRID_FEATURES 4  // of an entry: one block of rows
-#define PLACE_ROWS 4     // of a sample: u along x, y, z, and v
-#define LEVEL_VALUES 4   // of a level: n, first entry, number of entries, 1 if corners share entries
+#define GRID_FEATURES 4  // features of an entry: one block of rows
+#define PLACE_ROWS 4     // values of a sample: u along x, y, z, and v
+#define LEVEL_VALUES 4   // values of a level: n, first entry, number of entries, 1 if corners share entries
 #define HASH_Y 2654435761u
 #define HASH_Z 805459861u
 #define CORNERS 8
@@ -73,11 +73,11 @@ void grid_places(
     __global const float *restrict cones,  // [rays,RAY_VALUES_READ]
     __global const float *restrict edges,  // [rays,samples + 1]
     __global float *restrict places,       // [T,PLACE_ROWS,SAMPLES]
-    const float corner_x,                  // of the cube, scene units
+    const float corner_x,                  // corner of the cube, scene units
     const float corner_y,
     const float corner_z,
-    const float side,                      // of the cube, scene units
-    const uint samples,                    // of a ray: a multiple of LANES
+    const float side,                      // side of the cube, scene units
+    const uint samples,                    // samples of a ray: a multiple of LANES
     const uint count)                      // rays * samples
 {
     const uint first = get_global_id(0) * LANES;
@@ -144,7 +144,7 @@ void grid_backward(
     __global float *restrict gradient,           // [P] from first_parameter on: entries [entries,GRID_FEATURES]
     const uint first_parameter,
     const uint rows,
-    const uint parts,                            // of a level
+    const uint parts,                            // parts of a level
     const uint samples,                          // T * SAMPLES
     const uint count)                            // items: levels * parts
 {

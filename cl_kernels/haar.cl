@@ -69,7 +69,7 @@ __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void haar_backward(
     __global const float *restrict image,     // [3,H',stride] before the transform
     __global const float *restrict mask,      // [H',stride] 0 or 1; read where `masked`
-    __global const float *restrict gradient,  // [3,H',stride] of the transformed image, zero outside
+    __global const float *restrict gradient,  // [3,H',stride] dL/d(transformed image), zero outside
     __global float *restrict sums,            // [2,strips,stride/2] for u, v
     const uint masked,
     const float u,

@@ -11,7 +11,7 @@
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void lay_over(
     __global const float *restrict layer,          // [3,H',stride]
-    __global const float *restrict transmittance,  // [H',stride] of the layer
+    __global const float *restrict transmittance,  // [H',stride] transmittance of the layer
     __global const float *restrict image,          // [channels,H',stride]
     __global float *restrict composite,            // [channels,H',stride]
     __global float *restrict behind,               // [H',stride] T dL/dT
@@ -47,7 +47,7 @@ void lay_over(
 /* Replace the gradient of the composite with that of the image behind.  One group = one row.  No local memory. */
 __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void look_behind(
-    __global const float *restrict transmittance,  // [H',stride] of the layer
+    __global const float *restrict transmittance,  // [H',stride] transmittance of the layer
     __global float *restrict gradient,             // [3 or 4,H',stride] a fourth plane is unchanged
     const uint rows,                               // H'
     const uint stride)

@@ -7,7 +7,7 @@
 #define CLSPLAT_LAYERS_H
 #include "lanes.h"
 
-#define SAMPLES 64         // in a tile
+#define SAMPLES 64         // samples in a tile
 #define BLOCK 4            // outputs of an item; inputs and outputs of a layer are multiples of it
 #define CHUNK 16           // tiles whose gradients are summed together
 #define PARAMETER_LINE 64  // the parameters of a network are a multiple of it

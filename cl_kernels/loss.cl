@@ -103,7 +103,7 @@ __kernel __attribute__((reqd_work_group_size(TEAM, 1, 1)))
 void view_error(
     __global const float *restrict image,       // [3,H',stride]
     __global const float *restrict photograph,  // [3,H',stride]
-    __global const float *restrict gradient,    // [3,H',stride] of the loss with respect to the image
+    __global const float *restrict gradient,    // [3,H',stride] dL/d(image)
     __global float *restrict row_errors,        // [3,H']
     const uint width,
     const uint height,

@@ -20,7 +20,7 @@
 #include "adam.h"
 #include "motion.h"
 
-#define LOGIT_MAX 80.0f  // of e^o in float32
+#define LOGIT_MAX 80.0f  // largest o, so that e^o is finite in float32
 
 /* Plane of the first component of coefficient b_k. */
 static inline uint plane_of(const uint k) { return k == 1 ? 0u : 3u * k - 1u; }
@@ -53,8 +53,8 @@ void move_forward(
     __global const float *restrict logit_opacity,  // [S] at the centers
     __global float *restrict moved_means,          // [3,S] scene units; infinite where a Gaussian is not present
     __global float *restrict moved_logit,          // [S]
-    const float time,                              // of the scene, in [0, 1]
-    const uint degree,                             // of the polynomial, 1 to 3
+    const float time,                              // time of the view, in [0, 1]
+    const uint degree,                             // degree of the polynomial, 1 to 3
     const uint stride,
     const uint count)
 {
@@ -82,7 +82,7 @@ void turn_forward(
     __global const float *restrict motion,  // [W,S] see above
     __global const float *restrict quats,   // [4,S] unnormalized, at the centers
     __global float *restrict moved_quats,   // [4,S]
-    const float time,                       // of the scene, in [0, 1]
+    const float time,                       // time of the view, in [0, 1]
     const uint first,                       // plane of the turn
     const uint stride,
     const uint count)
@@ -104,8 +104,8 @@ void move_backward(
     __global const float *restrict grad_means,     // [3,S] at the time
     __global float *restrict grad_logit_opacity,   // [S] at the time; becomes that at the center
     __global float *restrict grad_motion,          // [W,S]; its turn is unchanged
-    const float time,                              // of the scene, in [0, 1]
-    const uint degree,                             // of the polynomial, 1 to 3
+    const float time,                              // time of the view, in [0, 1]
+    const uint degree,                             // degree of the polynomial, 1 to 3
     const uint stride,
     const uint count)
 {
@@ -131,7 +131,7 @@ void move_backward(
             VSTORE((m.present ? grad_mean * power : zero), grad_motion + at);
         }
     }
-    const VF grad_presence = grad_logit * ((1.0f + odds) / divisor);  // with respect to log g
+    const VF grad_presence = grad_logit * ((1.0f + odds) / divisor);  // dL/d(log g)
     const VF distance = m.dt * m.inverse_duration;
     grad_center = grad_center + grad_presence * (distance * m.inverse_duration);
     VSTORE((m.present ? grad_center : zero), grad_motion + MOTION_CENTER * stride + i);
@@ -145,7 +145,7 @@ void turn_backward(
     __global const float *restrict motion,      // [W,S] see above
     __global const float *restrict grad_quats,  // [4,S] at the time
     __global float *restrict grad_motion,       // [W,S]
-    const float time,                           // of the scene, in [0, 1]
+    const float time,                           // time of the view, in [0, 1]
     const uint first,                           // plane of the turn
     const uint stride,
     const uint count)
@@ -171,13 +171,13 @@ void motion_step(
     __global const float *restrict gradient,  // [W,S]
     __global float *restrict moment1,         // [W,S]
     __global float *restrict moment2,         // [W,S]
-    __global const uint *restrict depth_key,  // [S] of the view: all ones when culled
+    __global const uint *restrict depth_key,  // [S] the view's: all ones when culled
     const float rate,                         // learning rate / (1 - BETA1^t)
     const float correction2,                  // 1 / (1 - BETA2^t)
     const float lowest,                       // bounds of the values after an update
     const float highest,
     const uint every,                         // all ones: each Gaussian is updated; 0: only Gaussians not culled
-    const uint first,                         // plane
+    const uint first,                         // first plane
     const uint stride,
     const uint count)
 {

@@ -24,7 +24,7 @@
 
 #define BOX_FOOTPRINT 0.1f  // px^2, added to V for a splat's extent and tiles, with 1/2 px on every side
 
-#define CDF_SLOPE 1.5957691f  // of P at 0: sqrt(8 / pi)
+#define CDF_SLOPE 1.5957691f  // slope of P at 0: sqrt(8 / pi)
 #define CDF_CUBIC 7.333173e-2f
 #define CDF_QUINTIC (-5.9424e-4f)
 #define CDF_REACH 6.0f     // standard deviations

@@ -64,10 +64,10 @@ void project_forward(
     const float screen_variance,                     // px^2
     const float compensate,                          // 0 or 1
     const float opacity_factor,                      // 1, or that of the step's dropout
-    const uint row_begin,                            // of the band of tiles whose pairs are listed
+    const uint row_begin,                            // first row of tiles whose pairs are listed
     const uint row_end,
-    const uint hidden_plane,                         // of the view
-    const uint hidden_bit,                           // of the view; 0: no Gaussian is hidden
+    const uint hidden_plane,                         // plane of the view's bit in `hidden`
+    const uint hidden_bit,                           // the view's bit; 0: no Gaussian is hidden
     const uint degree,
     const uint sh_block,                             // values of a block in a slot
     const uint stride,

@@ -11,7 +11,7 @@
 #include "lanes.h"
 #include "random.h"
 
-#define RAY_VALUES 8                  // of a ray: o, d, radius of the cone, |d|
+#define RAY_VALUES 8                  // values of a ray: o, d, radius of the cone, |d|
 #define CONE_RADIUS 0.577350269f      // 2 / sqrt(12)
 #define BLUR_PADDING 0.01f            // alpha of equation 18
 #define WEIGHT_FLOOR 1.0e-5f          // smallest sum of a ray's weights (released code)
@@ -23,8 +23,8 @@
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void draw_pixels(
     __global uint *restrict pixels,  // [rays] row * width + column
-    const uint pixel_count,          // of the photograph
-    const uint first_ray,            // of the step
+    const uint pixel_count,          // number of pixels of the photograph
+    const uint first_ray,            // index of the first ray in the step
     const uint seed,
     const uint step,
     const uint rays)
@@ -69,8 +69,8 @@ void spread_edges(
     __global float *restrict edges,  // [count,samples + 1] distances
     const float near,
     const float far,
-    const uint samples,              // of a ray
-    const uint first_ray,            // of the step
+    const uint samples,              // samples of a ray
+    const uint first_ray,            // index of the first ray in the step
     const uint drawn,                // 1: moved at random by up to 1/2 interval, 0: even
     const uint seed,
     const uint step,
@@ -109,7 +109,7 @@ void resample_edges(
     __global float *restrict fine,           // [count,fine_samples + 1]
     const uint samples,
     const uint fine_samples,
-    const uint first_ray,                    // of the step
+    const uint first_ray,                    // index of the first ray in the step
     const uint drawn,                        // 1: within the part of an edge, 0: even
     const uint seed,
     const uint step,

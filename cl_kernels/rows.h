@@ -49,7 +49,7 @@ static inline row_splat_t splat_on_lines(const float *splat, const float (*lines
     return s;
 }
 #else
-#define LINE_FIELDS 3   // of row_splat_t: b, c, power_min
+#define LINE_FIELDS 3   // fields of row_splat_t: b, c, power_min
 #define SLOPE_FIELDS 2  // dy, slope
 #define SPLAT_AT(splat, lines, y, column) splat_on_lines(splat, lines, 0, y)
 

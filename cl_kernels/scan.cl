@@ -42,7 +42,7 @@ void scan_offsets(
     const uint run,
     const uint count)
 {
-    __local ulong sums[TEAM], sums_before[TEAM];  // of the item's values, and of its part of the earlier blocks
+    __local ulong sums[TEAM], sums_before[TEAM];  // sums of the item's values, and of its part of the earlier blocks
     const uint item = get_local_id(0);
     const uint first = (get_group_id(0) * TEAM + item) * run;
     ulong sum = 0;

@@ -12,16 +12,16 @@
 #include "adam.h"
 #include "planes.h"
 
-#define RUN_WORDS 8   // of a run: row, first column, column after the last, packed position, the four texels
+#define RUN_WORDS 8   // words of a run: row, first column, column after the last, packed position, the four texels
 #define CORNERS 4     // texels around a pixel: (i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)
-#define RUN_SUMS 12   // of a run: for each corner red, green, blue
-#define PLACE_BITS 12 // of i + 1 and j + 1 in a packed position; then a bit for each of x, y, z that is negative
-#define SKY_EPSILON 1.0f  // of Adam: the L1 gradient of one wrong pixel (ours)
+#define RUN_SUMS 12   // sums of a run: for each corner red, green, blue
+#define PLACE_BITS 12 // bits of i + 1 and j + 1 in a packed position; then the signs of x, y, z, 1 if negative
+#define SKY_EPSILON 1.0f  // epsilon of Adam: the L1 gradient of one wrong pixel (ours)
 #define BORDER 16         // columns of zeros on either side of the matches; rows: 1
-#define MATCH_FRACTION 0.6f  // of the 3 x 3 pixels around a pixel that must match (splatfacto-w, Xu et al. 2024)
+#define MATCH_FRACTION 0.6f  // fraction of 3 x 3 pixels that must match (splatfacto-w, Xu et al. 2024)
 
 typedef struct {
-    float row, i, j;             // of the ray; of the first texel
+    float row, i, j;             // row of the ray; indices of the first texel
     float sign_x, sign_y, sign_z;
     uint at, first, end;         // index of the row; columns
 } run_t;
@@ -117,7 +117,7 @@ void sky_matches(
     __constant camera_t *restrict camera,       // [1]
     __global const float *restrict photograph,  // [3,H',stride]
     __global float *restrict matches,           // [H' + 2,stride + 2 BORDER] initially zero
-    const float difference,                     // up to which a pixel matches
+    const float difference,                     // largest difference of a matching pixel
     const float half_side,                      // side / 2
     const uint map_plane,                       // side * side
     const uint plane,                           // H' * stride
@@ -256,9 +256,9 @@ void sky_update(
     __global float *restrict texels,             // [3,side * side]
     __global float *restrict moment1,            // [3,side * side]
     __global float *restrict moment2,            // [3,side * side]
-    __global float *restrict biases,             // [2,side * side] of the moments
+    __global float *restrict biases,             // [2,side * side] bias corrections of the moments
     const float rate,
-    const float pixels,                          // of a gradient of 1: 3 width height
+    const float pixels,                          // factor on the gradient: 3 width height
     const uint map_plane,                        // side * side
     const uint shown)
 {

@@ -7,7 +7,7 @@
 #define CLSPLAT_SLOTS_H
 #include "lanes.h"
 
-#define NO_SLOT 0xffffffffu  // for a block in host memory
+#define NO_SLOT 0xffffffffu  // slot of a block in host memory
 
 #if SH_SLOTS
 #define SH_STRIDE(stride) ((uint)LANES)

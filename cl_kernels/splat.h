@@ -31,7 +31,7 @@
 #define SPLAT_X_MIN 11
 #define SPLAT_X_MAX 12
 #define SPLAT_POWER_MIN 13 // ln(ALPHA_MIN / opacity)
-#define SPLAT_INVERSE_DEPTH 14  // of the mean, scene units^-1
+#define SPLAT_INVERSE_DEPTH 14  // 1/z of the mean, scene units^-1
 
 /* fields of a gradient record, [RECORD] floats: sums over pixels, with p = dL/dpower and w = alpha T */
 #define SUM_POWER 0    // p; divided by the opacity it is dL/dopacity
