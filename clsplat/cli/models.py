@@ -506,7 +506,7 @@ def _video_text(result: dict[str, Any], columns: int) -> str:
     """Describe a video in a line of text: its size, duration, and rendering time."""
     first, *others = (Path(name) for name in result["files"])
     width, height = result["size"]
-    summary = f"{result['frames']} frames of {columns * width} x {height} px in {result['took']:.1f} s"
+    summary = f"{pluralize(result['frames'], 'frame')} of {columns * width} x {height} px in {result['took']:.1f} s"
     if first.suffix in (".png", ".npy"):
         return f"{first.parent}: {summary}"
     extra_files = "".join(f", {path.name}" for path in others)
