@@ -347,7 +347,7 @@ def test_only_performed_attempts_count(tmp_path, dense, caplog):
     matches, cameras = prepared(tmp_path, [unrelated_photograph(number) for number in range(4)])
     with pytest.raises(DataError, match="no two of them show the same features"):
         map_cameras(matches, cameras, attempts=3)
-    tried = [text.rpartition(" with ")[2] for text in caplog.messages if "trying again" in text]
+    tried = [text.rpartition(" with ")[2] for text in caplog.messages if "retrying" in text]
     assert tried == ["smaller angles and fewer matches", "denser features"]
 
 

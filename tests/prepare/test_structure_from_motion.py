@@ -156,7 +156,7 @@ def test_further_attempts_use_the_matching_mode_or_are_off(photos, tmp_path, mon
     caplog.set_level("INFO")
     with pytest.raises(DataError, match="could not be registered"):
         map_cameras(tmp_path / "matches", tmp_path / "once", attempts=1)
-    assert "trying again" not in caplog.text
+    assert "retrying" not in caplog.text
     used, more = list[Pairing](), list[int]()
     monkeypatch.setattr(mapping_tool, "match_database", lambda database, pairing: used.append(pairing))
     monkeypatch.setattr(mapping_tool, "match_pairs", lambda database, pairs, threads: more.append(len(pairs)))
