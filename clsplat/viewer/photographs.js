@@ -19,7 +19,9 @@ class Photographs {
     this.range = this.bar.querySelector("input");
     this.line = this.frame.querySelector("i");
     const prefix = commonPrefix(views.map(view => view.name));
-    this.items = views.map((view, i) => this.item(view, i, view.name.slice(prefix.length)));
+    const [extension] = views[0]?.name.match(/\.\w+$/) ?? [""];
+    const end = views.every(view => view.name.endsWith(extension)) ? -extension.length || undefined : undefined;
+    this.items = views.map((view, i) => this.item(view, i, view.name.slice(prefix.length, end)));
     choices("comparison", "comparison", name => this.compare(name));
     this.range.addEventListener("input", () => { this.share = this.range.value / 100; this.place(); });
     this.line.addEventListener("pointerdown", event => this.line.setPointerCapture(event.pointerId));
@@ -42,7 +44,9 @@ class Photographs {
     image.alt = "";
     [image.width, image.height] = [Math.round(64 * view.lens[4] / view.lens[5]), 64];
     image.draggable = false;
-    name.textContent = label.length > 9 && image.width < 80 ? `…${label.slice(-8)}` : label;
+    const width = Math.min(Math.max(image.width, 44), 160); // px, as in viewer.css
+    const fitting = Math.floor((width - 10) / 6); // characters; the ends of names differ most
+    name.textContent = label.length > fitting ? `…${label.slice(1 - fitting)}` : label;
     item.append(image, name);
     item.addEventListener("click", () => this.choose(i));
     this.strip.append(item);

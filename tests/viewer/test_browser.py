@@ -138,6 +138,7 @@ def test_filmstrip_images_jump_to_their_cameras(opened):
     opened.rest()
     assert opened.run("viewer.at") == 2
     assert opened.run("document.getElementById('caption').textContent") == "0003.png"
+    assert opened.run("document.querySelector('#strip [aria-current]').innerText") == "0003"
     assert opened.run("document.getElementById('comparison').hidden"), "a training view has no photo in the page"
     pose = opened.run(POSE)
     np.testing.assert_allclose(pose[:3], scene(Path()).views[2].position, atol=1e-6)
