@@ -131,6 +131,7 @@ void update_gaussians(
     __global const float *restrict pair_sums,        // [P,RECORD]
     __global const uint *restrict first_pair,        // [N]
     __global const uint *restrict tile_count,        // [N]
+    __global const uint *restrict pair_count,        // [2] see pairs.cl; without room for the pairs, nothing changes
     __global float *restrict grad_mean2d,            // [2,S] px^-1
     __global const float *restrict radius,           // [S] px, 0 = not seen
     __global float *restrict seen,                   // [S] views
@@ -163,7 +164,7 @@ void update_gaussians(
     const uint count)
 {
     const uint i = get_global_id(0) * LANES * VECTORS;
-    if (i >= count)
+    if (i >= count || pair_count[1])
         return;
     uint first[VECTORS], active = 0, unseen = 0;
     gradient_t g[VECTORS];

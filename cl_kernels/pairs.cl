@@ -5,7 +5,7 @@
 #include "tiles.h"
 
 /* The pairs of splats with a mask; large.cl adds those of large splats.  If there are more pairs than `capacity`, none
- * are listed.  One item = one position in `order`, and at least one item. */
+ * are listed, and all counts are 0.  One item = one position in `order`, and at least one item. */
 __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void emit_pairs(
     __global const uint *restrict tile_box,     // [S] see tiles.h
@@ -14,19 +14,26 @@ void emit_pairs(
     __global const uint *restrict pair_offset,  // [N+1] first pair of each position
     __global uint *restrict pair_tile,          // [capacity]
     __global uint *restrict pair_splat,         // [capacity]
+    __global uint *restrict tile_count,         // [S] pairs of each Gaussian
     __global uint *restrict first_pair,         // [N] first pair of each Gaussian
-    __global uint *restrict pair_count,         // [1] listed pairs
+    __global uint *restrict pair_count,         // [2] listed pairs; 1 if there are more than `capacity`
     __global uint *restrict tile_pair_count,    // [T] starts at 0
     const uint tiles_x,
     const uint capacity,
     const uint count)
 {
     const uint position = get_global_id(0), pairs = pair_offset[count];
-    if (position == 0)
+    if (position == 0) {
         pair_count[0] = pairs <= capacity ? pairs : 0;
-    if (position >= count || pairs > capacity)
+        pair_count[1] = pairs > capacity;
+    }
+    if (position >= count)
         return;
     const uint i = order[position];
+    if (pairs > capacity) {
+        tile_count[i] = 0;
+        return;
+    }
     uint pair = pair_offset[position];
     first_pair[i] = pair;
     const uint box = tile_box[i], width = box >> (2 * BOX_BITS), low = (1u << BOX_BITS) - 1;

@@ -111,6 +111,8 @@ class ImageLoss(Loss):
     """Whether the value is the same if image and photo are swapped, as the module `haar` requires."""
     reads_photograph: ClassVar[bool] = True
     """Whether the loss compares the image with the photo; training needs at least one such loss."""
+    runs_on_host: ClassVar[bool] = False
+    """Whether `add` waits for the image.  Others may be called for an incomplete image, whose result is not used."""
 
     def required_content(self, step: int) -> Content:
         """Return the planes of the image that the loss needs at a global step: colors, or colors and inverse depth."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ class HostLoss(ImageLoss):
 
     Arrays are [height, width, 3] float32.  Each step copies both images to the host and the gradient back.
     """
+
+    runs_on_host: ClassVar[bool] = True
 
     weight: NonNegative = 1.0
     _function: HostFunction = PrivateAttr()

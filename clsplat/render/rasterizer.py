@@ -266,8 +266,8 @@ class Rasterizer:
         """Wait for the number of pairs, and return whether they fit; if not, `start_forward` must be repeated."""
         try:
             return self.tiler.has_room(frame.lists)
-        except TooManyPairs as error:
-            self._split_pairs(frame.camera, error)
+        except TooManyPairs:
+            self._halve_bands(frame.camera)  # `start_forward` raises an error if a single row does not fit
             return False
 
     def start_forward(
@@ -405,10 +405,10 @@ class Rasterizer:
             return projection
 
         key = "project", model.key, camera.size, band, content
-        projection = self.workspace.plans.run(key, {**visibility, "camera": camera.array}, launch)
-        inputs = projection.splats, projection.footprints, band, gaussians.count
         limit = MAX_PAIRS if rows == 1 else self._limit  # a single row cannot be split further
         while True:
+            projection = self.workspace.plans.run(key, {**visibility, "camera": camera.array}, launch)
+            inputs = projection.splats, projection.footprints, band, gaussians.count
             lists = self.tiler.build(*inputs, limit, model.defines)
             if rows == camera.tiles_y or self.tiler.has_room(lists):  # the lists of several bands share their memory
                 return projection, lists
@@ -445,7 +445,8 @@ class Rasterizer:
             try:
                 return self._pixel_sums(model, frame, bands, grad_image, count, texture, transmittance_gradient)
             except MemoryLimitError:
-                if not self._halve_bands(frame.camera):
+                has_room = frame.lists.pairs <= frame.lists.capacity  # otherwise, bands would not be of this frame
+                if not (has_room and self._halve_bands(frame.camera)):
                     raise
                 bands = self._split(frame.camera)
 
@@ -473,15 +474,16 @@ class Rasterizer:
                 if self._lanes == 1:  # the states in front of buckets are those of the last band
                     frame_inputs = frame.model, frame.camera, band, self._black, frame.content, frame.splats, lists
                     self._blend_band(*frame_inputs, prefix="second ")
-            changes["pair_sums"] = self.workspace.array("pair_sums", (lists.pairs, RECORD))
+            pairs = lists.capacity if len(bands) == 1 else lists.pairs  # their number is known only in bands
+            changes["pair_sums"] = self.workspace.array("pair_sums", (pairs, RECORD), slack=1.0)
             flags = {"is_summed": is_summed, "is_first": i == 0, "has_behind": bool(transmittance_gradient)}
             self._sum_band(model, frame, band, lists, pixel_sums, changes, **flags)
         pair_sums, gaussians = changes["pair_sums"], model.gaussians
-        pairs = {"pair_sums": pair_sums, "first_pair": lists.first_pair, "tile_count": lists.tile_count}
+        arguments = {"pair_sums": pair_sums, "first_pair": lists.first_pair, "tile_count": lists.tile_count}
         key = "sum records", gaussians.key, count, pair_sums.buffer.serial, lists.key
         inputs = pair_sums, lists, gaussians, pixel_sums, 0
         launch = partial(self.workspace.plans.run, key, {}, sum_records, *inputs)
-        return PixelSums(pixel_sums, pairs, None if is_summed else launch)
+        return PixelSums(pixel_sums, arguments, None if is_summed else launch)
 
     def _sum_band(
         self,

@@ -39,7 +39,7 @@ class Footprints:
 class TileLists:
     """Pairs in emission order, contiguous for each Gaussian, and the depth order of each tile.
 
-    The lists are empty if there are more pairs than `capacity`; see `Tiler.has_room`.
+    The lists and `tile_count` are empty if there are more pairs than `capacity`; see `Tiler.has_room`.
     """
 
     read_pairs: Callable[[], int]  # returns the number of pairs; waits for the device
@@ -50,11 +50,12 @@ class TileLists:
     tile_count: Array  # [S] pairs of each Gaussian
     tile_offset: Array  # [T+1]
     tile_pairs: Array  # [capacity] pairs ordered by tile, front to back
+    pair_count: Array  # [2] listed pairs; 1 if there are more than `capacity`
 
     @property
     def key(self) -> tuple[int, ...]:
         """Numbers that identify the memory of the lists, as a part of the keys of plans."""
-        arrays = self.pair_splat, self.first_pair, self.tile_count, self.tile_offset, self.tile_pairs
+        arrays = self.pair_splat, self.first_pair, self.tile_count, self.tile_offset, self.tile_pairs, self.pair_count
         return tuple(array.buffer.serial for array in arrays)
 
     @cached_property
@@ -159,7 +160,7 @@ class Tiler:
         """List up to `capacity` pairs; return the arrays of TileLists."""
         pair_tile, pair_splat = self._pair_array("pair_tile", capacity), self._pair_array("pair_splat", capacity)
         first_pair = self.workspace.array("first_pair", count, np.uint32)
-        pair_count = self.workspace.array("pair_count", 1, np.uint32)
+        pair_count = self.workspace.array("pair_count", 2, np.uint32)
         large = self._large_arguments(splats, footprints, band, count)
         self.device.program("pairs.cl", **COUNTING[sort]).emit_pairs(
             items=max(count, 1),
@@ -169,6 +170,7 @@ class Tiler:
             pair_offset=pair_offset,
             pair_tile=pair_tile,
             pair_splat=pair_splat,
+            tile_count=footprints.tile_count,
             first_pair=first_pair,
             pair_count=pair_count,
             tile_pair_count=large["tile_pair_count"],
@@ -189,12 +191,12 @@ class Tiler:
             tile_offset, tile_pairs = self._sort_in_tiles(
                 pair_tile, pair_splat, footprints.depth_key, pair_count, large["tile_pair_count"], capacity, band.tiles
             )
-        return pair_splat, first_pair, footprints.tile_count, tile_offset, tile_pairs
+        return pair_splat, first_pair, footprints.tile_count, tile_offset, tile_pairs, pair_count
 
     def has_room(self, lists: TileLists) -> bool:
         """Wait for the number of pairs, and return whether they fit; if not, raise the capacity for the next `build`.
 
-        Raises TooManyPairs if there are more than the limit.
+        The splats must then be projected again.  Raises TooManyPairs if there are more pairs than the limit.
         """
         if lists.pairs <= lists.capacity:
             return True

@@ -16,7 +16,9 @@ from clsplat.core.settings import OneOf
 from clsplat.density.statistics import SplatStats
 from clsplat.losses.base import ImageLoss, Loss, Penalty, ViewGradients
 from clsplat.metrics.views import distribution
+from clsplat.photos.photographs import Photograph
 from clsplat.photos.sampling import Sampler, ViewSettings
+from clsplat.photos.transforms import PhotographTransform
 from clsplat.stages.densify import Densify
 from clsplat.stages.evaluate import Evaluate
 from clsplat.training.adam import Adam, Rates, Rows, attach_gradients
@@ -388,21 +390,27 @@ class Optimize(ValidatedTraining):
         """Run one step.  A failure before its update leaves the run at the previous step."""
         run.step += 1
         run.stage_step += 1
-        try:
-            gradients, frozen = self._differentiate(run, trainer, sampler)
-        except BaseException:  # also a second Ctrl-C
-            run.step, run.stage_step = run.step - 1, run.stage_step - 1
-            run.device.timings.sampling = False
-            raise
-        with run.editing_tables():
-            trainer.update(gradients, frozen)
-            run.during_index, run.edited = 0, False
+        is_done, step_inputs = False, None
+        while not is_done:
+            try:
+                step_inputs = step_inputs or self._prepare_inputs(run, trainer, sampler)
+                inputs, frozen = step_inputs
+                gradients = trainer.start(*inputs)
+            except BaseException:  # also a second Ctrl-C
+                run.step, run.stage_step = run.step - 1, run.stage_step - 1
+                run.device.timings.sampling = False
+                raise
+            with run.editing_tables():
+                if is_done := trainer.update(gradients, frozen):
+                    run.during_index, run.edited = 0, False
         run.device.timings.sampling = False
         run.status.note(step=run.step)
         return gradients
 
-    def _differentiate(self, run: Run, trainer: StepTrainer, sampler: Sampler) -> tuple[ViewGradients, set[str]]:
-        """Return the losses and gradients of a view, and the names of the parameters not to update."""
+    def _prepare_inputs(
+        self, run: Run, trainer: StepTrainer, sampler: Sampler
+    ) -> tuple[tuple[Photograph, int, Sequence[PhotographTransform]], set[str]]:
+        """Return the inputs of `StepTrainer.start`, and the names of the parameters not to update."""
         run.device.timings.sampling = run.step % self.log_every == self.log_every // 2  # away from density edits
         sample = sampler.at(run.step)
         photograph = run.photographs.get_nonempty(sample.view, sample.original, sample.index)
@@ -410,5 +418,4 @@ class Optimize(ValidatedTraining):
         run.photographs.prefetch(sampler.at(run.step + offset).view for offset in offsets)
         frozen = {name for stage in self.during if stage.is_due(run.step) for name in stage.frozen_parameters(run)}
         trainer.losses = [*self.losses, *run.losses]
-        gradients = trainer.differentiate(photograph, run.step, sample.transforms)
-        return gradients, set() if run.stage_step == self.steps else frozen
+        return (photograph, run.step, sample.transforms), set() if run.stage_step == self.steps else frozen

@@ -137,13 +137,15 @@ class Adam:
 
         Returns the gradient of the projected means, [2, S] px⁻¹, which is valid until the next update.
         statistics: the result of `SplatStats.update_arguments`, to add the view to these statistics; without it, only
-        this gradient is written.
+        this gradient is written.  Nothing changes on the device if the frame has no room for its pairs
+        (`Rasterizer.is_complete`).
         """
-        gaussians, rows, grad_mean2d = self.gaussians, self._effective_rows(rows), self._mean2d()
+        gaussians, rows, grad_mean2d = self.gaussians, self.effective_rows(rows), self._mean2d()
         sums = {"pixel_sums": pixel_sums, "has_pairs": 0} if isinstance(pixel_sums, Array) else pixel_sums.arguments()
         unused = {"first_pair": frame.depth_key, "tile_count": frame.depth_key, "pair_sums": grad_mean2d}
         changes: dict[str, Any] = {
             "camera": frame.camera.array,
+            "pair_count": frame.lists.pair_count,
             **{name: sums.pop(name, array) for name, array in unused.items()},
         }
         arrays = {"splats": frame.splats, "grad_mean2d": grad_mean2d, "radius": frame.radius, **sums}
@@ -189,7 +191,7 @@ class Adam:
 
         Harmonics above the active degree are skipped, because their gradients and moments are zero.
         """
-        gaussians, rows = self.gaussians, self._effective_rows(rows)
+        gaussians, rows = self.gaussians, self.effective_rows(rows)
         deferred = None if "sh_rest" in frozen else self._prepare_deferred(rows, model, rates)
         for name in PARAMETERS:
             if name in frozen or (name == "sh_rest" and not rates[name]):
@@ -247,7 +249,7 @@ class Adam:
             self._grad_mean2d = self.gaussians.device.empty(shape)
         return self._grad_mean2d
 
-    def _effective_rows(self, rows: Rows) -> Rows:
+    def effective_rows(self, rows: Rows) -> Rows:
         """Return the rows to update; updates of offloaded harmonics are always deferred until a view sees them."""
         return "deferred" if rows == "all" and self.gaussians.on_host else rows
 

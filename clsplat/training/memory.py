@@ -17,7 +17,7 @@ from clsplat.render.rasterizer import PIXEL_SUMS, RECORD
 from clsplat.scene.view import View
 
 VISIBLE_FRACTION = 0.5  # fraction of Gaussians visible in one view, an estimate; only their harmonics are on the device
-PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs, an estimate; trained scenes have 1.5 to 4
+PAIRS_PER_GAUSSIAN = 5  # (tile, Gaussian) pairs with tiles of 16 px, an estimate; trained scenes have 1.5 to 4
 FRAME_GAUSSIAN = 4 * (RECORD + 2 + 5 + 7)  # bytes: records, mean2d; keys and radius; sorting by depth
 MOVED_GAUSSIAN = 4 * (3 + 4 + 1)  # bytes: means, quaternions, and logits at the time of a view
 FRAME_PAIR = 4 * (RECORD + 6)  # bytes: gradient record; tile and Gaussian of the pair; sorting by tile
@@ -40,6 +40,7 @@ class MemoryPlan:
     memory: int  # total memory of the device
     allocation: int  # largest size of a single buffer
     host: int = 0  # bytes per Gaussian, in the memory of the host
+    pairs: float = PAIRS_PER_GAUSSIAN  # per Gaussian
 
     def required_bytes(self, gaussians: int) -> int:
         """Return the bytes that Gaussians need, including spare capacity for growth and a copy of the largest table."""
@@ -47,14 +48,14 @@ class MemoryPlan:
 
     @property
     def _per_gaussian(self) -> float:
-        return GROWTH * self.gaussian + self.largest_table + PAIRS_PER_GAUSSIAN * self.pair
+        return GROWTH * self.gaussian + self.largest_table + self.pairs * self.pair
 
     @property
     def limit(self) -> int:
         """The largest number of Gaussians that fits in the total memory, with each table in one buffer."""
         by_total = (self.memory - self.fixed) / self._per_gaussian
         by_table = self.allocation // self.largest_table // ALIGNMENT * ALIGNMENT
-        by_pairs = self.allocation / (PAIRS_PER_GAUSSIAN * 4 * RECORD)
+        by_pairs = self.allocation / (self.pairs * 4 * RECORD)
         return max(0, int(min(by_total, by_table, by_pairs)))
 
     def text(self, gaussians: int) -> str:
@@ -123,12 +124,14 @@ def plan(
     pixel_sums: int = PIXEL_SUMS,
     harmonics: Location = "device",
     visible: float = VISIBLE_FRACTION,
+    tile: int = 16,
 ) -> MemoryPlan:
     """Return the memory plan for Gaussians.  components: number of components of each table, by name.
 
     photographs: bytes of photographs on the device; pixels: number of pixels of the largest view, in full tiles;
     pixel_sums: number of sums over pixels per Gaussian in the backward pass; harmonics: where the bands above 0 are
-    stored; visible: fraction of Gaussians whose harmonics are on the device for a view, if they are offloaded.
+    stored; visible: fraction of Gaussians whose harmonics are on the device for a view, if they are offloaded; tile:
+    side of a tile, px.
     """
     fractions = dict.fromkeys(HARMONICS, visible) if harmonics == "host" else {}
     bytes_by_table = {name: math.ceil(4 * width * fractions.get(name, 1)) for name, width in components.items()}
@@ -138,4 +141,5 @@ def plan(
     gaussian_bytes = sum(sizes) + FRAME_GAUSSIAN + 4 * pixel_sums + gradients + motion_bytes
     fixed_bytes = photographs + FRAME_PIXEL * pixels
     host_bytes = sum(4 * components.get(name, 0) for name in fractions)
-    return MemoryPlan(gaussian_bytes, FRAME_PAIR, fixed_bytes, max(sizes), limits.memory, limits.allocation, host_bytes)
+    memory = limits.memory, limits.allocation, host_bytes, PAIRS_PER_GAUSSIAN * 16 / tile
+    return MemoryPlan(gaussian_bytes, FRAME_PAIR, fixed_bytes, max(sizes), *memory)

@@ -217,7 +217,7 @@ class Run:
         image_bytes += module_bytes(getattr(self.settings, "stages", ()), views, tile)
         pixels = max_pixels(views, tile)
         pixel_sums = PIXEL_SUMS if self.stats is None else self.stats.pixel_sums
-        return plan(self.device.info, components, image_bytes, pixels, pixel_sums, harmonics, visible)
+        return plan(self.device.info, components, image_bytes, pixels, pixel_sums, harmonics, visible, tile)
 
     def refresh_filter(self) -> None:
         """Recompute the world filter and the sampling intervals for the current Gaussians."""

@@ -77,8 +77,8 @@ class StepTrainer:
 
         Returns the losses and the gradients, which are valid until the next step.
         """
-        gradients = self.differentiate(photograph, step, transforms)
-        self.update(gradients, frozen)
+        while not self.update(gradients := self.start(photograph, step, transforms), frozen):
+            pass
         return gradients
 
     def differentiate(
@@ -96,6 +96,15 @@ class StepTrainer:
         Raises ConfigError for a loss that is neither an ImageLoss nor a Penalty, and for a loss that a module does not
         support.
         """
+        while not (losses := self._compare(photograph, step, transforms)).step.is_complete:
+            pass
+        return losses
+
+    def start(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform] = ()) -> ViewGradients:
+        """Differentiate like `differentiate`, without waiting: if `update` returns False, repeat both."""
+        return self.backward(self._compare(photograph, step, transforms))
+
+    def _compare(self, photograph: Photograph, step: int, transforms: Sequence[PhotographTransform]) -> ViewLosses:
         content = required_content(self.losses, step)
         workspace, timings = self.rasterizer.workspace, self.rasterizer.device.timings
         data = TrainingStep(step, self.rasterizer, photograph, self.model, self.background, self.losses, transforms)
@@ -104,11 +113,10 @@ class StepTrainer:
             module.before_render(data)
         camera = data.camera
         data.frame = self.rasterizer.start_forward(data.model, camera, data.background, content)
+        data.frames.append((self.rasterizer, data.frame))
         timings.section = "loss"
         backgrounds = self.background, data.background
         data.planes = data.photograph.planes(workspace, transforms, step, backgrounds)
-        while not self.rasterizer.is_complete(data.frame):  # the only wait of a step
-            data.frame = self.rasterizer.start_forward(data.model, camera, data.background, content)
         data.image, data.gradient = data.frame.image, workspace.array("grad_image", data.frame.image.shape)
         for module in data.modules:
             module.after_render(data)
@@ -122,7 +130,10 @@ class StepTrainer:
             apply_mask(workspace, camera, target, mask)
         for module in data.modules:
             module.before_losses(data)
-        data.losses += add_losses([loss for loss in self.losses if isinstance(loss, ImageLoss)], comparison)
+        image_losses = [loss for loss in self.losses if isinstance(loss, ImageLoss)]
+        if any(loss.runs_on_host for loss in image_losses) and not data.is_complete:
+            return self._compare(photograph, step, transforms)
+        data.losses += add_losses(image_losses, comparison)
         data.losses += data.module_losses
         return ViewLosses(data.frame, comparison, data.losses, step=data)
 
@@ -143,13 +154,32 @@ class StepTrainer:
             module.after_backward(data)
         return ViewGradients(data.frame, data.comparison, data.losses, data.sums, step=data)
 
-    def update(self, gradients: ViewGradients, frozen: Collection[str] = ()) -> None:
-        """Update the parameters, Adam's moments, the statistics, and the modules with the result of `differentiate`."""
+    def update(self, gradients: ViewGradients, frozen: Collection[str] = ()) -> bool:
+        """Update the parameters, Adam's moments, the statistics, and the modules with the result of `start`.
+
+        Returns False, without any change, if a frame had no room for its pairs.  Waits only for the number of pairs.
+        """
+        data, counts = gradients.step, dict(self.adam.updates)
+        # without room, the fused kernel does nothing; it knows only the frame of the model, and no deferred updates
+        is_guarded = self._is_fused(data, frozen) and len(data.frames) == 1
+        is_guarded = is_guarded and self.adam.effective_rows(self.rows) != "deferred"
+        if not (is_guarded or data.is_complete):
+            return False
         grad_mean2d, has_statistics = self._update_parameters(gradients, frozen)
-        for module in reversed(gradients.step.modules):  # in the order in which the device finished their gradients
-            module.update(gradients.step)
+        if is_guarded and not data.is_complete:
+            self.adam.updates.update(counts)
+            return False
+        for module in reversed(data.modules):  # in the order in which the device finished their gradients
+            module.update(data)
         self.rasterizer.device.timings.section = "statistics"
         self.stats.add(gradients, grad_mean2d, has_statistics)
+        return True
+
+    def _is_fused(self, data: TrainingStep, frozen: Collection[str]) -> bool:
+        """Return whether one kernel computes the gradients and updates the parameters with them."""
+        has_penalty = any(isinstance(loss, Penalty) for loss in self.losses)
+        has_motion_or_depth = self.model.gaussians.is_moving or data.frame.content == "inverse_depth"
+        return not (has_penalty or frozen or has_motion_or_depth or self.views_per_update != 1)
 
     def _update_parameters(self, view_gradients: ViewGradients, frozen: Collection[str]) -> tuple[Array, bool]:
         """Update the parameters and add the penalties to the view's losses.
@@ -158,16 +188,11 @@ class StepTrainer:
         updates the parameters and adds statistics without writing gradients to memory, unless the training uses
         penalties, frozen parameters, motion, depths, or several views per update.
         """
-        penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
-        step = view_gradients.comparison.step
+        gaussians, step = self.model.gaussians, view_gradients.comparison.step
         rates = self.rates.at(step, self.extent)
-        gaussians, has_depth = self.model.gaussians, view_gradients.frame.content == "inverse_depth"
-        has_several_views = self.views_per_update != 1
-        if not (penalties or frozen or gaussians.is_moving or has_depth or has_several_views):
-            is_fused = (
-                self.stats.is_in_update and self.rasterizer.device.schedule != "wide"
-            )  # CPUs sum faster separately
-            sums = view_gradients.sums if is_fused else view_gradients.pixel_sums
+        if self._is_fused(view_gradients.step, frozen):
+            sums_pairs = self.stats.is_in_update and self.rasterizer.device.schedule != "wide"  # slower on CPUs
+            sums = view_gradients.sums if sums_pairs else view_gradients.pixel_sums
             inputs = self.model, view_gradients.frame, sums, rates, self.rows
             return self.adam.update(*inputs, self.stats.update_arguments()), True
         gradients = self.rasterizer.gradients(self.model, view_gradients.frame, view_gradients.pixel_sums)
@@ -175,8 +200,9 @@ class StepTrainer:
         penalty_gradients = gradients.without_deferred() if is_deferred else gradients
         penalty_inputs = PenaltyInputs(self.rasterizer.workspace, gaussians, penalty_gradients, self.extent, step)
         self.rasterizer.device.timings.section = "loss"
+        penalties = [loss for loss in self.losses if isinstance(loss, Penalty)]
         view_gradients.losses.extend(require_loss_value(penalty, penalty.add(penalty_inputs)) for penalty in penalties)
-        if has_several_views:
+        if self.views_per_update != 1:
             attach_gradients(gaussians)
             gradients = add_gradients(gaussians, gradients)
             if step % int(at_step(self.views_per_update, step)):

@@ -207,7 +207,8 @@ def _emitted(device, frame, box, mask, count):
     pair_tile, pair_splat = (device.upload(np.full(guarded, untouched)) for _ in range(2))
     first_pair = device.zeros(len(count), np.uint32)
     written = {"first_pair": first_pair, "pair_tile": pair_tile, "pair_splat": pair_splat}
-    written["pair_count"] = device.zeros(1, np.uint32)
+    written["pair_count"] = device.zeros(2, np.uint32)
+    written["tile_count"] = device.upload(count)
     written["tile_pair_count"] = device.zeros(frame.camera.tiles, np.uint32)
     size = {"tile_box": device.upload(box), "tiles_x": frame.camera.tiles_x, "count": len(count)}
     device.program("pairs.cl").emit_pairs(
@@ -222,7 +223,6 @@ def _emitted(device, frame, box, mask, count):
     device.program("large.cl").emit_large(
         groups=1,
         splats=frame.splats,
-        tile_count=device.upload(count),
         row_begin=0,
         row_end=frame.camera.tiles_y,
         run=len(count),

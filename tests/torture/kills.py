@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import clsplat
-from clsplat.conformance import quick
 from clsplat.core.files import PARTIAL
 from clsplat.training import checkpoint
 from clsplat.training.records import Records
@@ -104,7 +103,6 @@ class Attempt:
             log = os.open(out.with_suffix(".txt"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
             os.dup2(log, 1)
             os.dup2(log, 2)
-            quick.forget_after_sudden_ends = lambda cache: None  # a check of the device is longer than the run
             self._train(scene, out, recipe)
             code = 0
         except BaseException:

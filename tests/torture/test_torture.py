@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from clsplat.conformance import quick
 from tests.torture import __main__ as torture
-from tests.torture import each_file, kills
+from tests.torture import kills
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not hasattr(os, "fork"), reason="attempts are forked")]
 
@@ -34,17 +33,6 @@ def test_kill_at_a_random_time(tiny_scene, tmp_path):
     tally = json.loads(done.stdout.splitlines()[-1])
     assert tally["killed"] >= 1
     assert tally["equal"] == tally["finished"] > 0
-
-
-@pytest.mark.parametrize("kind", [kills.Attempt, each_file.AtFile])
-def test_device_is_checked_only_once(kind, tmp_path):
-    class Seen(kind):
-        def _train(self, scene: Path, out: Path, recipe: str) -> None:
-            out.write_text(quick.forget_after_sudden_ends.__module__)
-
-    out = tmp_path / "run"
-    Seen(tmp_path, out, *(["smoke"] if kind is kills.Attempt else [])).wait()
-    assert out.read_text() == kills.__name__
 
 
 def test_leftover_file_counts_once(monkeypatch, tmp_path):

@@ -48,11 +48,13 @@ class Pair:
         """The step with what the photograph has in front of it."""
         camera = self.camera(number)
         pixels = self.device.upload(np.zeros((3, 36, 50), np.uint8))
-        step = TrainingStep(at, self.rasterizer, Photograph(camera, pixels), self.model, self.black, (), ())
-        step.frame = self.rasterizer.forward(self.model, camera, self.black)
-        step.image = step.frame.image
-        self.own.after_render(step)
-        return step
+        while True:
+            step = TrainingStep(at, self.rasterizer, Photograph(camera, pixels), self.model, self.black, (), ())
+            step.frame = self.rasterizer.forward(self.model, camera, self.black)
+            step.image = step.frame.image
+            self.own.after_render(step)
+            if step.is_complete:
+                return step
 
     def joined(self) -> DeviceModel:
         """One model of the scene's Gaussians, and those of the first photograph just before its camera."""

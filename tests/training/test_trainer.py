@@ -5,6 +5,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from clsplat.conformance.checks.images import image_pair as images
@@ -18,7 +19,7 @@ from clsplat.losses.base import ImageLoss, Loss, require_loss_value
 from clsplat.losses.host import HostLoss
 from clsplat.losses.image import L1, L2, Dssim
 from clsplat.losses.penalties import Anisotropy
-from clsplat.opencl.device import Device
+from clsplat.opencl.device import Array, Device
 from clsplat.opencl.discovery import DeviceInfo
 from clsplat.photos.photographs import Photographs
 from clsplat.photos.sampling import Sampler
@@ -30,6 +31,7 @@ from clsplat.scene.detect import read_scene
 from clsplat.training.adam import Adam, Rates
 from clsplat.training.trainer import StepTrainer
 from tests.support.device_images import gradient_of, trainer_of
+from tests.support.devices import NAMES, each_once, on_devices
 
 STEPS = 8  # of smoke, before its first edit
 PENALTIES = (
@@ -92,6 +94,61 @@ def test_differentiating_updates_nothing(device, rng):
     for name, table in before.items():
         np.testing.assert_array_equal(trainer.model.gaussians.get(name), table)
     assert trainer.adam.updates["means"] == 0
+
+
+@on_devices(
+    "missing, sort, rows, losses",
+    each_once(
+        [1, None],
+        ["bitonic", "radix"],
+        ["all", "all", "seen", "deferred"],
+        [
+            [L1(weight=0.8), Dssim(weight=0.2)],
+            [L1(), Anisotropy(above=1.0)],
+            [HostLoss(lambda *_: mean_difference(*_))],
+        ],
+    ),
+)
+def test_step_without_room_is_repeated(device, rng, missing, sort, rows, losses):
+    """Room for all pairs but `missing`, or for a single pair: the same bits as with room."""
+    state, pairs, results = rng.bit_generator.state, [], []
+    for is_short in (False, True):
+        rng.bit_generator.state = state
+        trainer, photograph = trainer_of(device, rng, losses)
+        trainer.rasterizer.tiler.sort, trainer.rows = sort, rows
+        for step in range(1, 4):
+            if is_short:
+                trainer.rasterizer.tiler._capacity = pairs[step - 1] - missing if missing else 1
+            frame = trainer.step(photograph, step).frame
+            pairs.append(frame.lists.pairs)
+            assert frame.lists.capacity >= frame.lists.pairs
+        gaussians = trainer.model.gaussians
+        results.append({name: gaussians.get(name) for name in gaussians.tables} | trainer.adam.updates)
+    for name, expected in results[0].items():
+        np.testing.assert_array_equal(results[1][name], expected, err_msg=name)
+    assert trainer.adam.updates["means"] == 3
+
+
+@pytest.mark.parametrize("device", [(name, setting) for name in NAMES for setting in ("simt", "simt16")], indirect=True)
+def test_step_waits_after_its_last_launch(device, rng, monkeypatch):
+    """Nothing is allocated, and nothing read but the number of pairs."""
+    trainer, photograph = trainer_of(device, rng, [L1(weight=0.8), Dssim(weight=0.2)])
+    trainer.rasterizer.tiler.sort, events = "bitonic", []
+    photograph = replace(photograph, mask=None)
+    for step in range(1, 4):
+        trainer.step(photograph, step)
+    copy, enqueue, empty = Array._copy_later, cl.enqueue_nd_range_kernel, Device.empty
+
+    def copy_later(array, host, **part):
+        wait = copy(array, host, **part)
+        return lambda: [events.append("wait"), wait()][1]
+
+    monkeypatch.setattr(Array, "_copy_later", copy_later)
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", lambda *a: [events.append("launch"), enqueue(*a)][1])
+    monkeypatch.setattr(Device, "empty", lambda *a: [events.append("allocation"), empty(*a)][1])
+    trainer.step(photograph, 4)
+    assert events == ["launch"] * (len(events) - 1) + ["wait"]
+    assert len(events) > 10
 
 
 def test_update_uses_the_mean_gradient_of_several_views(device, rng):

@@ -245,9 +245,9 @@ class BenchCase:
     def _planned_bytes(self) -> int:
         camera = self.photograph.camera
         gaussians = self.trainer.model.gaussians
-        pixels, pixel_sums = camera.stride * camera.rows, self.trainer.stats.pixel_sums
-        info, components = gaussians.device.info, gaussians.components
-        return plan(info, components, self.photograph.nbytes, pixels, pixel_sums).required_bytes(gaussians.count)
+        sizes = self.photograph.nbytes, camera.stride * camera.rows, self.trainer.stats.pixel_sums
+        memory = plan(gaussians.device.info, gaussians.components, *sizes, tile=camera.tile)
+        return memory.required_bytes(gaussians.count)
 
     def _measure_work(self) -> Work:
         assert self.frame is not None

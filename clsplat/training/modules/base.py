@@ -41,6 +41,7 @@ class TrainingStep:
     loss_settings: Sequence[Loss]
     transforms: Sequence[PhotographTransform]
     frame: Frame = field(init=False)
+    frames: list[tuple[Rasterizer, Frame]] = field(default_factory=list)  # of the model, and those that modules start
     planes: Planes = field(init=False)  # the photograph and its mask
     image: Array = field(init=False)  # image that the losses compare with the photograph; a module may replace it
     gradient: Array = field(init=False)  # gradient of the image; each `backward` replaces it with that of its input
@@ -51,6 +52,11 @@ class TrainingStep:
     sums: PixelSums = field(init=False)
     modules: "Sequence[ModuleState]" = ()  # forward in this order, backward in reverse
     _saved: dict[int, Any] = field(default_factory=dict)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all frames had room for their pairs; otherwise, the step must be repeated.  Waits for the number."""
+        return all([rasterizer.is_complete(frame) for rasterizer, frame in self.frames])
 
     @property
     def pixel_sums(self) -> Array:
@@ -88,7 +94,7 @@ class ModuleState:
     """The state of a module during training.
 
     Only `update` changes scalars and tables; other hooks change only the step.  A step that
-    fails before its update therefore leaves the run unchanged.
+    fails before its update therefore leaves the run unchanged, and a step without room for its pairs is repeated.
     """
 
     after_training: ClassVar[Literal["dropped", "kept", "active"]] = "dropped"

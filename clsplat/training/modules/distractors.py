@@ -109,7 +109,8 @@ class DistractorsState(ModuleState):
         camera, gaussians = step.camera, self.adams[self._rows[step.view_index]].gaussians
         model = replace(step.model, gaussians=gaussians, degree=0, near=NEAR_FRACTION, sky=None, dropout=None)
         moved_camera = move_camera(self.rasterizer.workspace, camera, np.eye(3, 4))
-        frame = self.rasterizer.forward(model, moved_camera, self._black)
+        frame = self.rasterizer.start_forward(model, moved_camera, self._black)
+        step.frames.append((self.rasterizer, frame))
         scale = at_step(self.settings.cover, step.number) / (camera.width * camera.height)
         layer = composite_layer(step.workspace, frame, step.image, scale)
         step.image = layer.image
