@@ -173,7 +173,10 @@ def test_stages_with_other_axes_units_and_transforms_are_read(model, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda data: data.replace(b"opacities", b"opaqueness"), "Gaussians have no opacities; export the file again"),
+        (
+            lambda data: data.replace(b"opacities", b"opaqueness"),
+            "its Gaussians have no opacities; export the file again",
+        ),
         (lambda data: data[:-2], "is damaged, or has values of unsupported types .*brace"),
         (lambda data: data.replace(b"scales = [(", b"scales = [(x"), "is damaged, or has values of unsupported types"),
         (
