@@ -35,7 +35,7 @@ INTRODUCTIONS = {
     "views": "How a training step picks and changes its photo: the keys `order` and `transforms` of `optimize.views`.",
     "filters": "Keys of `model`: the two low-pass filters, in the scene and on the screen, and the background.",
     "adaptations": "`adapt` names a class that derives "
-    "[settings from the photographs](../pipelines.md#settings-that-follow-from-the-photographs).",
+    "[settings chosen automatically](../pipelines.md#settings-chosen-automatically).",
     "prepare": "`prepare` lists the steps that turn photographs into a scene, once, on the host.",
 }
 WORDS = {"integer": "whole number", "string": "text", "boolean": "true or false", "null": "none", "object": "keys"}
