@@ -158,7 +158,8 @@ def _unpack(archive: Path, out: Path, report: Report) -> None:
             total = sum(size for _, size, _ in members)
             if total > MAX_UNPACKED_SIZE:
                 raise DataError(
-                    f"{archive}: would unpack to {total >> 30} GiB; expected at most {MAX_UNPACKED_SIZE >> 30} GiB"
+                    f"{archive}: would unpack to {total >> 30} GiB; expected at most {MAX_UNPACKED_SIZE >> 30} GiB; "
+                    "use another archive"
                 )
             report(f"unpacking {len(members)} files, {total / 1e6:,.0f} MB")
             for name, size, open_member in members:

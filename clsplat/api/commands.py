@@ -193,7 +193,7 @@ def evaluate(
 
     load_plugins()
     if invalid_values := [value for value in downscales or () if not 1 <= value < math.inf]:
-        raise ConfigError(f"--downscales: expected downscale factors of at least 1, got {invalid_values[0]:g}")
+        raise ConfigError(f"downscales: expected factors of at least 1, got {invalid_values[0]:g}")
     perceptual = Perceptual.open(metric_names(metrics), to_path(lpips), lpips_input)
     return ModelFile(Path(model), to_path(scene), device).evaluate(downscales, perceptual)
 

@@ -55,7 +55,10 @@ def run(
     if quality != "standard":
         pipeline = commands.find_variant(pipeline, quality)
     if minutes is not None and dry_run:
-        raise ConfigError("--minutes times some training steps, and --dry-run does not train; use only one of them")
+        raise ConfigError(
+            "--minutes has to train a few steps to measure their time, and --dry-run does not train; "
+            "use only one of them"
+        )
     if resume and restart:
         raise ConfigError("--resume continues a run and --restart starts it over; use only one of them")
     start: Literal["new", "resume", "restart"] = "resume" if resume else "restart" if restart else "new"

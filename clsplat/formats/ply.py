@@ -175,7 +175,8 @@ def _make_header(
     names = [element.name for element in elements]
     if "vertex" not in names:
         raise DataError(
-            f"{path}: has no vertices, only {shorten(', '.join(names)) or 'a header'}; expected 'element vertex N'"
+            f"{path}: has no vertices, only {shorten(', '.join(names)) or 'a header'}; expected 'element vertex N'; "
+            "export it again"
         )
     *preceding_elements, vertex = elements[: names.index("vertex") + 1]
     if lists := [element.name for element in preceding_elements if element.has_list]:
@@ -440,5 +441,5 @@ def _read_header(part: Path) -> PlyHeader:
         header = parse_ply_header(part, file.read(MAX_HEADER))
     dtypes = {header.dtype[name] for name in header.dtype.names or ()}
     if header.format != "binary_little_endian" or list(header.sections) != ["vertex"] or dtypes != {np.dtype("<f4")}:
-        raise DataError(f"{part}: expected a PLY written by `export`; export it again")
+        raise DataError(f"{part}: expected the PLY that the block's run wrote; train that block again")
     return header

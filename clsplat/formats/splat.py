@@ -94,7 +94,9 @@ def write_splat(path: Path, splats: SplatFile, options: WriteOptions) -> str:
     color = np.concatenate([p["sh_base"].astype(np.float64) * SH_C0 + 0.5, alpha], axis=1)
     warn_clipped(path, "splat", "colors from 0 to 1", exceeds_byte(255 * color))
     if p["sh_rest"].shape[1]:
-        LOG.warning("%s: .splat stores no SH coefficients, so colors do not depend on the view; other formats do", path)
+        LOG.warning(
+            "%s: .splat stores no SH coefficients, so colors do not depend on the view; other formats store them", path
+        )
     rows["color"] = np.clip(np.rint(255 * color), 0, 255)
     rows["rotation"] = np.clip(np.rint(128 * normalize_quats(p["quats"]) + 128), 0, 255)
     return write_bytes(path, rows[order].tobytes())

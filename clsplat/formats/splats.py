@@ -86,6 +86,7 @@ MIP_VARIANCE = 0.1  # px²: screen filter of files that only say `mip` (Yu et al
 MAX_FILE = 1 << 33  # bytes of the largest file
 MAX_VALUE = 1e15  # largest absolute value in the tables of BOUNDED; viewers and codebooks fail beyond it
 BOUNDED = ("log_scales", "sh_base", "sh_rest", MOTION)
+APPLY_TRANSFORM = "apply it in the program that exported the file, and export again"  # remedy in errors
 MIN_ALPHA = 1e-6  # opacities of 0 and 1 have no logit
 # fraction of out-of-range values above which another unit is assumed; mirrored axes also have negative scales
 MIN_OUTSIDE = 0.5
@@ -234,7 +235,7 @@ def transform(
     Raises ValueError for a matrix that is not a rotation, and for a scale that is not positive.
     """
     if not scale > 0 or rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5):
-        raise ValueError("expected a positive scale and a rotation matrix [3, 3]")
+        raise ValueError("expected a rotation with a uniform, positive scale")
     if np.linalg.det(rotation) < 0:
         raise ValueError("expected a rotation; this matrix is a reflection")
     return {
@@ -261,7 +262,8 @@ def join_parts(
             try:
                 tables = transform(part, scale, relative[:3, :3] / (scale or 1), relative[:3, 3])
             except ValueError as error:
-                raise DataError(f"{path}: the transform of a node is not supported: {error}") from error
+                fault = f"the transform of a node is not supported ({error})"
+                raise DataError(f"{path}: {fault}; {APPLY_TRANSFORM}") from error
             part = part | {name: table.astype(np.float32) for name, table in tables.items()}
         joined.append(part)
     placement = np.eye(4) if first is None else FLIP_4 @ first @ FLIP_4

@@ -484,7 +484,7 @@ def _check_size(path: Path, header: SpzHeader, limit: int) -> None:
     """Raise DataError if the declared splats take more than `limit` bytes, MemoryLimitError if memory is too small."""
     if (total := sum(header.sizes)) > limit:
         raise DataError(
-            f"{path}: declares {header.count} splats of {total} bytes, more than it can contain ({limit}); "
+            f"{path}: declares {header.count} splats, {total} bytes in total, more than it can contain ({limit}); "
             "the file is truncated or damaged: copy or export it again"
         )
     require_memory(path, header.count, min(header.degree, MAX_DEGREE))

@@ -102,8 +102,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: filenames is {quote(names)}; expected distinct file names; export it again")
     if not isinstance(counts, list) or not 1 <= len(counts) <= MAX_LEVELS:
         raise DataError(
-            f"{path}: counts is {quote(counts)}; expected a number for each of 1 to {MAX_LEVELS} levels; export it "
-            "again"
+            f"{path}: counts is {quote(counts)}; expected a list with one number per level, for 1 to {MAX_LEVELS} "
+            "levels; export it again"
         )
     if (levels := meta.get("lodLevels")) != len(counts):
         raise DataError(

@@ -272,6 +272,9 @@ def _matrix(path: Path, parents: Sequence[Prim]) -> NDArray[np.float64]:
             elif kind.startswith("rotate"):
                 matrix[:3, :3] = Rotation.from_euler(kind[6:].lower(), values, degrees=True).as_matrix()
             else:
-                raise DataError(f"{path}: the transform {quote(name.decode())} is not supported; export it again")
+                raise DataError(
+                    f"{path}: the transform {quote(name.decode())} is not supported; apply (bake) the transforms in "
+                    "the program that exported the file, and export it again"
+                )
             result = result @ (np.linalg.inv(matrix) if order != name else matrix)
     return result

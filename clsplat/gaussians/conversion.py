@@ -380,7 +380,7 @@ def _extract_frame(model: Model, time: float) -> Model:
         raise ConfigError("the model does not move; omit --time and --frames")
     frame = model.at(time)
     if not len(frame):
-        raise DataError(f"none of {len(model):,} Gaussians is visible at time {time:g}; use another time")
+        raise DataError(f"none of the {len(model):,} Gaussians is visible at time {time:g}; use another time")
     return frame
 
 

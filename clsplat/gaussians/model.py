@@ -16,6 +16,7 @@ from clsplat.formats import splats as columns
 from clsplat.formats.ply import MAX_NUMBER
 from clsplat.formats.sog_quantize import is_before_gap
 from clsplat.formats.splats import (
+    APPLY_TRANSFORM,
     MAX_DEGREE,
     MAX_EXPONENT,
     MAX_LOG,
@@ -407,5 +408,6 @@ def load(path: str | Path, options: ReadOptions | None = None) -> Model:
         try:
             model = model.transformed(scale, rotation, shift)
         except ValueError as error:
-            raise DataError(f"{path}: the transform of a node is not supported ({error}); apply it") from error
+            fault = f"the transform of a node is not supported ({error})"
+            raise DataError(f"{path}: {fault}; {APPLY_TRANSFORM}") from error
     return replace(model, origin=origin) if origin.any() else model

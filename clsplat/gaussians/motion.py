@@ -76,8 +76,8 @@ def with_motion(tables: Sequence[Parameters], names: Sequence[str]) -> list[Para
     if len(names_by_width) > 1:
         first, second, *_ = names_by_width.values()
         raise DataError(
-            f"{second}: its motion differs from {first} in degree or rotation; merge them at one "
-            "time (`clsplat convert MODEL OUT --time T`)"
+            f"{second}: its motion and that of {first} differ in degree or rotation; convert both to the same time "
+            "first (`clsplat convert MODEL OUT --time T`), then merge them"
         )
     return [
         {**table, MOTION: table.get(MOTION, static_motion(len(table["means"]), *names_by_width))}

@@ -44,11 +44,11 @@ class Lpips:
         except cv2.error as error:
             raise DataError(
                 f"{path}: not an ONNX file that OpenCV {cv2.__version__} can read ({_last_line(error)}); "
-                "write one with clsplat data lpips"
+                "write one with `clsplat data lpips`"
             ) from error
         if (distance := self.distance(gray, gray)) != 0:
             raise ConfigError(
-                f"{path}: not LPIPS: equal images have distance {distance:g}; write it with clsplat data lpips"
+                f"{path}: not LPIPS: equal images have distance {distance:g}; write it with `clsplat data lpips`"
             )
 
     def distance(self, image: NDArray[np.uint8], photograph: NDArray[np.uint8]) -> float:
@@ -227,7 +227,7 @@ def _flip_package() -> ModuleType:
     try:
         import flip_evaluator
     except ImportError as error:
-        raise ConfigError("metric 'flip' needs an extra package; in a checkout, pip install '.[metrics]'") from error
+        raise ConfigError("metric 'flip' needs a package; in a checkout, run `pip install '.[metrics]'`") from error
     return flip_evaluator  # type: ignore[no-any-return]
 
 

@@ -227,16 +227,16 @@ def log_color_metrics(averages: dict[str, Any]) -> None:
         return
     psnr_color, reason = averages["psnr_color"], averages.get("psnr_color_reason")
     if psnr_color is None:
-        LOG.warning("PSNR in the photos' colors cannot be measured: %s", reason)
+        LOG.warning("color-corrected PSNR cannot be measured: %s", reason)
     elif reason:
         LOG.warning(
-            "in the photos' colors: PSNR %.2f dB, the mean of %s: %s",
+            "color-corrected PSNR: %.2f dB, the mean of %s: %s",
             *(psnr_color, pluralize(averages["psnr_color_views"], "view"), reason),
         )
     else:
         is_notable = psnr_color - averages["psnr"] > NOTABLE_GAIN
         note = "; the photos' exposures differ, which PSNR counts as errors" if is_notable else ""
-        LOG.info("in the photos' colors: PSNR %.2f dB%s", psnr_color, note)
+        LOG.info("color-corrected PSNR: %.2f dB%s", psnr_color, note)
 
 
 # PSNR of a dynamic scene, separately for timestamps of training views and others.
@@ -364,7 +364,8 @@ def measure(
             empty_names.append(view.name)
     if empty_names:
         LOG.warning(
-            "almost nothing is rendered in %d of %s, such as %s; check model.near, and that model and cameras match",
+            "almost nothing is rendered in %d of %s, such as %s; check model.near, and check that the model "
+            "and the cameras match",
             *(len(empty_names), pluralize(len(views), "view"), quote(empty_names[0])),
         )
     flicker, psnrs = flicker_meter.flicker(), {result.view: result.psnr for result in results}

@@ -109,7 +109,10 @@ def _apply_variant(text: str, path: Path, file: Path, name: str) -> str:
     for key_path, value in {"name": path.stem, **settings}.items():
         if not (node := _node(root, key_path)):
             line = f"{file}:{document.line((name, key_path))}: {name}"
-            raise ConfigError(f"{line}: the file has no key {quote(key_path)}; expected one of its keys, as for --set")
+            raise ConfigError(
+                f"{line}: the pipeline has no key {quote(key_path)}; use the path of an existing key, as for --set, "
+                "such as optimize.steps"
+            )
         edits.append((node.start_mark.index, node.end_mark.index, value))
     next_start = len(text)  # start of the next edit: the end mark of a map is after the comments that follow it
     for start, stop, new_text in sorted(edits, reverse=True):

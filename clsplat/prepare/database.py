@@ -31,7 +31,7 @@ def require_pycolmap() -> ModuleType:
         with stopping_on_signals(lambda: signals.append(None)):
             import pycolmap
     except ImportError as error:
-        raise ConfigError("finding cameras needs pycolmap: pip install 'pycolmap>=4,<5'") from error
+        raise ConfigError("finding cameras needs pycolmap; run `pip install 'pycolmap>=4,<5'`") from error
     if signals:
         raise KeyboardInterrupt
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL.value)  # errors are raised as exceptions anyway

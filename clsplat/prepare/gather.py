@@ -135,7 +135,7 @@ def gather(photographs: Path, images: Path, names: list[str]) -> tuple[list[str]
     if times := read_times(photographs):
         write_times(images, {name: times[name] for name in readable_names if name in times})
     if readable_names and blank_count == len(readable_names):
-        raise DataError(f"{photographs}: all photos are blank; export or retake them")
+        raise DataError(f"{photographs}: all photos are blank; export them again, or retake them")
     if len(readable_names) < MIN_PHOTOGRAPHS:
         faults = first_few([f"{name} ({reason})" for name, reason in read_errors.items()])
         raise DataError(

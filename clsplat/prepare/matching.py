@@ -123,7 +123,7 @@ def match_pairs(database: Path, pairs: Sequence[tuple[str, str]], threads: int) 
         matched_count = db.num_matched_image_pairs()
     if not new_pairs:
         return
-    LOG.info("matching %s of photos without a camera", pluralize(len(new_pairs), "more pair"))
+    LOG.info("matching %s that include unregistered photos", pluralize(len(new_pairs), "more pair"))
     with raising_data_error(database, "match photos"), _count_pairs(database, matched_count + len(new_pairs)):
         _match_pairs(database, new_pairs, _make_options(pycolmap, threads))
 
@@ -142,7 +142,9 @@ def expand_pairs(database: Path, unregistered: Set[str]) -> list[tuple[str, str]
             return []
         if bad_names := [image.name for image in images if _has_space(image.name)]:
             LOG.warning(
-                "'%s': COLMAP's pair lists do not allow spaces in names, so no further pairs are matched", bad_names[0]
+                "'%s': COLMAP's pair lists do not allow spaces in names, so no more pairs of such photos are matched; "
+                "rename them",
+                bad_names[0],
             )
             images = [image for image in images if not _has_space(image.name)]
         is_unregistered = [image.name in unregistered for image in images]
@@ -194,7 +196,8 @@ def _read_similar_pairs(pycolmap: ModuleType, database: Path, neighbors: int) ->
         descriptors = _read_descriptors(db, images)
     if bad_names := [image.name for image in images if _has_space(image.name)]:
         raise DataError(
-            f"'{bad_names[0]}': COLMAP's pair lists do not allow spaces in names; rename it, or match all pairs"
+            f"'{bad_names[0]}': COLMAP's pair lists do not allow spaces in names; rename the photo, or use exhaustive "
+            "matching (matching: exhaustive)"
         )
     return [(images[i].name, images[j].name) for i, j in find_similar_pairs(descriptors, neighbors)]
 

@@ -4,6 +4,7 @@ import io
 import json
 import logging
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clsplat.conformance.quick import open_verified
-from clsplat.core.errors import ConfigError, DataError, shell_quote
+from clsplat.core.errors import ConfigError, DataError, quote, shell_quote
 from clsplat.core.files import METRICS, PIPELINE, open_atomic, path_exists, raising_output_error, write_text
 from clsplat.core.progress import counted
 from clsplat.core.reading import read_json
@@ -262,7 +263,9 @@ def write_renders(
     files = [{layer: _layer_path(path, layer) for layer in layers} for path in color_paths]
     paths = [path for layer_files in files for path in layer_files.values()]
     if len(set(paths)) < len(paths):
-        raise ConfigError(f"{out}: two images would have the same name; rename the view that ends in _{layers[-1]}")
+        duplicate = Counter(paths).most_common(1)[0][0].relative_to(out).as_posix()
+        remedy = "rename one of these views, or render fewer layers"
+        raise ConfigError(f"{out}: two renders would be named {quote(duplicate)}; {remedy}")
     _check_folder(out, paths, photographs)
     names = [path.relative_to(out).as_posix() for path in paths]
     record = {**_read_record(out), **dict.fromkeys(names, is_video)}

@@ -85,10 +85,8 @@ class RunScene:
         if blank := require_content(scene.path, original.split("train"), files):
             count = pluralize(len(blank), "photo")
             LOG.warning(
-                "%s: found %s without content (black, of a single color, or transparent): %s; export or remove them",
-                scene.path,
-                count,
-                first_few(blank),
+                "%s: %s %s blank (black, a single color, or transparent): %s; export them again, or remove them",
+                *(scene.path, count, "is" if len(blank) == 1 else "are", first_few(blank)),
             )
         return cls(original, downscaled_scene, background, Identity.from_scene(original, files))
 

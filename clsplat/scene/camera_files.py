@@ -137,7 +137,8 @@ def _make_view(frame: JsonFrame, index: int) -> View:
 def _read_array(frame: JsonFrame, key: str, shape: tuple[int, ...]) -> Floats:
     array = frame.array(key)
     if array.shape != shape or not np.isfinite(array).all():
-        raise DataError(f"{frame.source}: {key} is {quote(frame.value(key))}; expected finite numbers of shape {shape}")
+        fault = f"{key} is {quote(frame.value(key))}; expected finite numbers of shape {shape}"
+        raise DataError(f"{frame.source}: {fault}; export the file again")
     return array
 
 

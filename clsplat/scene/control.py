@@ -167,7 +167,9 @@ def read_control(path: Path) -> dict[str, MarkedPoint]:
             source = f"{path}:{reader.line_num}"
             name, photo = ((row[key] or "").strip() for key in ("point", "photo"))
             if not name or not photo or set(name) & set(",;=:+"):
-                raise DataError(f"{source}: expected a photo, and a point name without , ; = : +")
+                raise DataError(
+                    f"{source}: expected the name of a photo, and a name of a point without , ; = : +; correct this row"
+                )
             pixel = [_parse_number(source, key, row[key]) for key in ("u", "v")]
             texts = [(row[key] or "").strip() for key in "xyz"]
             coordinates = None
@@ -176,7 +178,8 @@ def read_control(path: Path) -> dict[str, MarkedPoint]:
                 coordinates = (x, y, z)
             old = points.get(name, MarkedPoint(name))
             if coordinates and old.coordinates and coordinates != old.coordinates:
-                raise DataError(f"{source}: point {quote(name)} has other coordinates in an earlier row; fix one row")
+                fault = f"point {quote(name)} has different coordinates in an earlier row"
+                raise DataError(f"{source}: {fault}; correct one of them")
             mark = Mark(photo, (pixel[0], pixel[1]))
             points[name] = MarkedPoint(name, (*old.marks, mark), coordinates or old.coordinates)
     except csv.Error as error:

@@ -95,7 +95,7 @@ def require_content(path: Path, views: Sequence[View], files: Mapping[Path, Imag
     blank_names = [view.name for view in views if view.image_path in files and files[view.image_path].is_blank]
     if blank_names and len(blank_names) == len(views):
         raise DataError(
-            f"{path}: all photos are blank: {first_few(blank_names)} are black, of a single color, or transparent; "
+            f"{path}: all photos are blank: {first_few(blank_names)} are black, a single color, or transparent; "
             "export them again"
         )
     return blank_names

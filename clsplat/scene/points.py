@@ -74,7 +74,9 @@ def read_ply_table(path: Path) -> PointTable:
         raise DataError(f"{path}: is big-endian; expected ascii or binary_little_endian: export it again")
     names = header.dtype.names or ()
     if not set(POINT.names or ()) <= set(names) or any(header.dtype[name] != np.uint8 for name in RGB):
-        raise DataError(f"{path}: expected vertices with x y z and uchar red green blue, found {quote(names)}")
+        raise DataError(
+            f"{path}: expected vertices with x y z and uchar red green blue, found {quote(names)}; export it again"
+        )
     if header.format == "ascii":
         table = read_ascii(path, data, header)
     else:

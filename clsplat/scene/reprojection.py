@@ -90,5 +90,5 @@ def require_points_in_front(points: PointCloud, scene: Scene) -> None:
     if not any((points.positions @ pose[2, :3] + pose[2, 3] > 0).any() for pose in poses):
         raise DataError(
             f"{scene.path}: all {len(points):,} points are behind all training cameras; poses and points "
-            "use different conventions: export both again, or use init: {source: sweep}"
+            "use different conventions: export both again, or use `init: {source: sweep}`"
         )

@@ -132,8 +132,8 @@ class Correspondences:
         if error > size / 2:
             values = "coordinates" if self.scale is None else "coordinates and --distance"
             raise DataError(
-                f"errors of {error:.3g} remain, and the points are only {size:.3g} from their center; "
-                f"check their {values}"
+                f"the points do not fit their known coordinates: the RMS error after alignment is {error:.3g}, and the "
+                f"points spread over only {size:.3g}; check the {values}"
             )
         shape = "nearly on a line" if self.up is None else "above each other"
         remedy = "add --level, or add points away from that line" if self.up is None else "add points at other places"

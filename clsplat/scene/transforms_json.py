@@ -227,9 +227,10 @@ def _frame_camera(frame: JsonFrame, size: tuple[int, int] | None) -> Camera:
     fx, fy = _read_focal(frame, "fl_x", "camera_angle_x", width), _read_focal(frame, "fl_y", "camera_angle_y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None or min(width, height) <= 0 or max(width, height) > MAX_SIDE or min(fx, fy) < MIN_FOCAL:
+        focal = "no focal length" if fx is None or fy is None else f"focal lengths {fx:g}, {fy:g}"
         raise DataError(
-            f"{frame.source}: the camera is {width}x{height} with focal lengths {fx}, {fy}; expected positive numbers "
-            f"from w, h (at most {MAX_SIDE}) and fl_x, fl_y or camera_angle_x: export the file again"
+            f"{frame.source}: the camera is {width}x{height} with {focal}; expected w and h from 1 to {MAX_SIDE}, and "
+            "a positive fl_x, fl_y, or camera_angle_x; export the file again"
         )
     cx, cy = frame.number("cx"), frame.number("cy")
     return Camera(width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)

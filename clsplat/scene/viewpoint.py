@@ -21,7 +21,7 @@ START_CAMERA = Camera(1200, 900, 1100.0, 1100.0, 600.0, 450.0)  # camera of a sc
 QUANTILES = 0.05, 0.95  # quantiles of the splats along each axis: the faces of the box to look at
 DISTANCE = 2.2  # from the start view to the center of the box, divided by half the diagonal of the box
 TOWARD_START = np.array([0.35, -0.25, -0.9])  # direction from the center to the start view
-NO_GROUND = "omit --level, or level the scene by its cameras with `clsplat align`"
+NO_GROUND = "omit --level, or use `clsplat align SCENE OUT --level cameras`"
 VISIBLE_FRACTION, MARGIN = 0.999, 1.05  # fraction of the splats in the start view, and a factor for space around them
 MAX_ZOOM_OUT = 2.0  # times the usual distance; splats that need more have a background, which may be outside the image
 

@@ -100,7 +100,8 @@ class Densify(Scheduled):
         run.records.add(run.step, "densify", **asdict(change))
         LOG.debug("step %d: %s -> %s", run.step, f"{change.before:,}", pluralize(change.after, "Gaussian"))
         if change.after == 0:
-            raise NumericError(f"step {run.step}: all Gaussians were pruned; weaken the prune rules or lower the rates")
+            remedy = "relax the prune rules, or lower the learning rates"
+            raise NumericError(f"step {run.step}: all Gaussians were pruned; {remedy}")
 
     def _has_growth_ended(self, run: Run) -> bool:
         """Return whether growth has ended.  If `patience` ends growth at this step, record the step in the run."""

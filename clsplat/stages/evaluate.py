@@ -23,7 +23,7 @@ Downscale = Annotated[float, Field(ge=1)]
 
 def _check_output_path(text: str) -> str:
     if fault := invalid_output_reason(text):
-        raise ValueError(f"expected a path inside the run folder: {fault}")
+        raise ValueError(f"cannot write to this path: {fault}; use another path inside the run folder")
     return text
 
 
@@ -91,7 +91,7 @@ class Evaluate(Scheduled):
                 self.split != "test" or run.pipeline["scene"]["holdout"] != 0
             ):  # no warning if the user wants no test views
                 key = "holdout" if self.split == "test" else "validation"
-                LOG.warning("no %s views: nothing to evaluate; scene.%s selects them", self.split, key)
+                LOG.warning("there are no %s views to evaluate; select some with scene.%s", self.split, key)
             return
         metrics, painter = self._open_metrics(), self._painter(run)
         for downscale in self.downscales or [run.downscale]:

@@ -49,7 +49,9 @@ class Export(Scheduled):
     @model_validator(mode="after")
     def _check_quality(self) -> "Export":
         if not writing_format(Path(self.file)).is_model:
-            raise ValueError(f"'{self.file}' is not a model, only points; use a name that ends in .ply, .spz, or .sog")
+            raise ValueError(
+                f"'{self.file}' would store only points, not a model; use a name that does not end in .points.ply"
+            )
         if self.quality != "balanced" and not writing_format(Path(self.file)).has_quality:
             raise ValueError(
                 f"'quality' applies to SPZ and SOG; expected a file that ends in .spz or .sog, got '{self.file}'"

@@ -37,7 +37,7 @@ MIN_POINTS = 100  # with fewer points from a sweep or a hull, random ones are us
 def scene_points(scene: Scene) -> PointCloud:
     """Return the points of a scene.  Raises DataError if it has no points, or if all are behind its cameras."""
     if scene.points is None:
-        raise DataError(f"{scene.path}: the scene has no points; use init: {{source: sweep}}")
+        raise DataError(f"{scene.path}: the scene has no points; use `init: {{source: sweep}}`")
     require_points_in_front(scene.points, scene)
     return scene.points
 
@@ -75,7 +75,7 @@ def sample_hull(run: Run, count: int) -> PointCloud | None:
     """Return at most `count` points on the visual hull, or None, with a warning, if there are too few."""
     points = hull_points(_training_views(run), *scene_box(run.scene), load_rgba, count, run.seed)
     if len(points) < MIN_POINTS:
-        remedy = "it needs photos with a transparent background and no mask files; otherwise, use init: {source: sweep}"
+        remedy = "it needs photos with a transparent background and no mask files; or use `init: {source: sweep}`"
         LOG.warning("the visual hull has only %d points; starting from random points; %s", len(points), remedy)
         return None
     return points

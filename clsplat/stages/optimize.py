@@ -104,14 +104,14 @@ class ValidatedTraining(Training):
         if self.keep == "last":
             return
         if not run.scene.split("validation"):
-            raise ConfigError("optimize.keep: best needs validation views; set scene.validation=auto")
+            raise ConfigError("`optimize.keep: best` needs validation views; set `scene.validation: auto`")
         self.require_measurement(run.step - run.stage_step)
         if run.stage_step == 0:
             run.best, run.best_tables = None, {}
 
     def check_pipeline(self, pipeline: Any) -> None:
         if self.keep == "best" and pipeline.scene.validation == 0:
-            raise ConfigError("optimize.keep: best needs validation views; set scene.validation: auto")
+            raise ConfigError("`optimize.keep: best` needs validation views; set `scene.validation: auto`")
         training_stages = [stage for stage in pipeline.stages if isinstance(stage, Training)]
         if self.refit and (count := sum(isinstance(stage, ValidatedTraining) for stage in training_stages)) > 1:
             raise ConfigError(f"optimize.refit: expected a single stage that trains, got {count}")
@@ -130,7 +130,7 @@ class ValidatedTraining(Training):
         stages = [stage for stage in self.order_stages(self.during) if _validates(stage)]
         if not any(stage.is_due(step, step == last) for stage in stages for step in range(start + 1, last + 1)):
             raise ConfigError(
-                "optimize.keep: best needs an evaluation of the validation views before the end; lower the "
+                "`optimize.keep: best` needs an evaluation of the validation views before the end; lower the "
                 "`every` of `evaluate` in `during`, or remove that stage to use the default one"
             )
 

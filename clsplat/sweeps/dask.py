@@ -37,7 +37,7 @@ try:
     import dask
     import distributed
 except ImportError:
-    raise ConfigError("this engine needs Dask: in a checkout, pip install '.[cluster]'") from None
+    raise ConfigError("this engine needs Dask; in a checkout, run `pip install '.[cluster]'`") from None
 
 __all__ = ["LOOPBACK", "SETTINGS", "dask", "distributed", "make_security"]
 LOOPBACK = "127.0.0.1"
@@ -251,7 +251,11 @@ class Cluster:
         while self._pending and time.monotonic() < deadline:
             time.sleep(0.1)
         if self._pending:
-            LOG.warning("some cells did not finish within %.0f s", STOP_TIMEOUT_S)
+            LOG.warning(
+                "some cells did not stop within %.0f s; run the same command with --resume to continue them from their "
+                "last checkpoints",
+                STOP_TIMEOUT_S,
+            )
         with self.settings:
             self._client.close()
             if self._cluster:

@@ -47,6 +47,7 @@ def split_device_cores(devices: Sequence[DeviceInfo], packing: int) -> list[Core
 METRIC_KEY = "clsplat"  # name of the Dask metric in which a worker describes its device
 CLASS_DIGITS = 8  # number of hexadecimal digits of a bits class
 RUN_TIMEOUT_S = 600.0  # maximum time of the fixed run; some runtimes need minutes to build kernels
+CHECK_DEVICE = "check the device with `clsplat doctor`"
 SCENE_OPTIONS = ("--size", "48", "--train", "8", "--test", "2", "--seed", "0")
 PIPELINE = "smoke"  # includes growth and opacity resets; SETTINGS add all SH bands and both filters
 SETTINGS = (
@@ -138,7 +139,7 @@ def _run_command(device: str, *arguments: str) -> None:
     """Run a `clsplat` command of the fixed run.  Raises DeviceError if it fails."""
     result = run_module("clsplat", *arguments, seconds=RUN_TIMEOUT_S)
     if result.code is None:
-        raise DeviceError(f"{device}: the test run did not finish within {RUN_TIMEOUT_S:.0f} s")
+        raise DeviceError(f"{device}: the test run did not finish within {RUN_TIMEOUT_S:.0f} s; {CHECK_DEVICE}")
     if result.code:
         lines = result.output.strip().splitlines()
-        raise DeviceError(f"{device}: the test run failed: {lines[-1] if lines else result.code}")
+        raise DeviceError(f"{device}: the test run failed ({lines[-1] if lines else result.code}); {CHECK_DEVICE}")

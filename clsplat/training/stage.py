@@ -35,7 +35,7 @@ def path_in_run(*suffixes: str) -> PathInRun:
         if fault is None and suffixes and not PurePosixPath(text).name.lower().endswith(suffixes):
             fault = f"it does not end in {', '.join(suffixes)}"
         if fault:
-            raise ValueError(f"expected a path inside the run folder: {fault}")
+            raise ValueError(f"cannot write to this path: {fault}; use another path inside the run folder")
         return text
 
     return PathInRun(check, suffixes)

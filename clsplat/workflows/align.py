@@ -240,7 +240,7 @@ def align(
         alignment = Alignment.solve(inputs, options)
         files = write_cameras(alignment.transform.transform_scene(inputs.scene), out, format_, images)
         if images == "none":
-            LOG.warning("%s: has no photos, without which no scene can be read; copy them to %s", out, out / IMAGES)
+            LOG.warning("%s: has no photos, and a scene needs them; copy them to %s", out, out / IMAGES)
         return {**alignment.data(), "files": [str(file) for file in files]}
     if inputs.model is None:
         raise ConfigError(f"{out}: is the name of a model, and {path} is a scene; use the name of a folder")

@@ -122,7 +122,7 @@ class Blocks:
     ) -> None:
         """execution: where blocks are trained; by default one after another in this process."""
         if execution is not None and not execution.has_store:
-            raise ConfigError("--on: blocks need a store; add `store` to the file of --on, or use another engine")
+            raise ConfigError("--on: blocks need a store; add `store` to that file, or use an engine other than inline")
         self.out, self.plan, self.execution = out, plan, execution
         self._device_name = device if isinstance(device, str) else None
         overrides = [f"scene.path={path_setting(photo_folder(scene))}"]

@@ -62,7 +62,7 @@ class MeshOptions:
         if not 0 < self.keep <= 1:
             raise ConfigError(f"--keep {self.keep:g}: expected a fraction of the faces above 0, up to 1")
         if self.keep < 1 and find_spec("fast_simplification") is None:  # before minutes of work
-            raise ConfigError("--keep needs fast-simplification; in a checkout, pip install '.[mesh]'")
+            raise ConfigError("--keep needs fast-simplification; in a checkout, run `pip install '.[mesh]'`")
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ NEAR = {
     "status nowhere": "nowhere: has no readable status.json; expected a run folder",
     "pipelines --copy x": "--copy needs the name of a pipeline",
     "evaluate x.ply": "x.ply: not found; expected a model file or a run folder",
-    "evaluate x.ply --scene y --downscales nan": "expected downscale factors of at least 1, got nan",
+    "evaluate x.ply --scene y --downscales nan": "expected factors of at least 1, got nan",
 }
 
 

@@ -17,7 +17,7 @@ from clsplat.pipeline.loading import load
 from tests.support.html_page import Page
 from tests.support.models import splats
 
-ENDS = "expected a path inside the run folder: it does not end in .ply"
+ENDS = "cannot write to this path: it does not end in .ply"
 UTM = np.array([5e5 + 0.25, -300.5, 4e6 + 0.125])
 
 
@@ -63,7 +63,7 @@ def test_points_are_no_model(name, model, tmp_path):
     clsplat.convert(tmp_path / "a.ply", tmp_path / name)
     with pytest.raises(DataError, match=f"{name}: "):
         clsplat.load(tmp_path / name)
-    with pytest.raises(ConfigError, match=rf"'{name}' is not a model, only points; use a name that ends in|{ENDS}"):
+    with pytest.raises(ConfigError, match=rf"'{name}' would store only points, not a model; .*|{ENDS}"):
         load("splat_7k", [f"export.file={name}"])
 
 

@@ -254,11 +254,11 @@ WRONG = {
         "_9/meta.json: cannot be read (No such file",
     ),
     "too few names": ({"filenames": []}, "refers to a missing file of level 0"),
-    "no counts": ({"counts": []}, "expected a number for each of 1 to 64 levels"),
+    "no counts": ({"counts": []}, "expected a list with one number per level, for 1 to 64 levels"),
     "more levels than are declared": ({"lodLevels": 2}, "lodLevels is 2; expected 3, the length of counts"),
     "more levels than there can be": (
         {"counts": [0] * 65, "lodLevels": 65},
-        "expected a number for each of 1 to 64 levels",
+        "expected a list with one number per level, for 1 to 64 levels",
     ),
     "no number of levels": ({"lodLevels": None}, "lodLevels is None; expected 3"),
     "a level beyond": (

@@ -115,8 +115,8 @@ def test_rotated_harmonics_match_rotated_directions(rng):
         ({"rotation": np.diag([1, 1, -1])}, "mirrors"),
         ({"rotation": 2 * np.eye(3)}, "a rotation matrix"),
         ({"rotation": np.eye(2)}, "a rotation matrix"),
-        ({"scale": 0}, "a positive scale"),
-        ({"scale": float("nan")}, "a positive scale"),
+        ({"scale": 0}, "positive scale"),
+        ({"scale": float("nan")}, "positive scale"),
         ({"translation": 1.0}, r"the translation has shape \(\)"),
     ],
 )

@@ -132,7 +132,7 @@ def test_series_is_complete_or_absent(tmp_path):
     motion = model.motion.copy()
     motion[:, 3:5] = 0.0, np.log(0.01)
     replace(model, motion=motion).save(tmp_path / "brief.ply")
-    with pytest.raises(DataError, match=r"--frames 3: time 0\.5: none of 40 .*; nothing was written"):
+    with pytest.raises(DataError, match=r"--frames 3: time 0\.5: none of the 40 .*; nothing was written"):
         clsplat.convert(tmp_path / "brief.ply", tmp_path / "frames", frames=3)
     with pytest.raises(DataError, match="nothing was written"):
         clsplat.convert(tmp_path / "brief.ply", tmp_path / "frame.spz", frames=3)

@@ -309,7 +309,7 @@ def test_variants_before_other_keys_leave_those_as_they_are(write, tmp_path):
 @pytest.mark.parametrize(
     ("short", "words"),
     [
-        ("short:\n  optimize.stepps: 5\n", r"small.yaml:18: short: the file has no key 'optimize.stepps'"),
+        ("short:\n  optimize.stepps: 5\n", r"small.yaml:18: short: the pipeline has no key 'optimize.stepps'"),
         ("short:\n  steps: 5\n", r"no key 'steps'"),
         ("short:\n  optimize.during.2.every: 5\n", r"no key 'optimize.during.2.every'"),
         ("short: [1]\n", r"expected a mapping 'short' with values for small_7k.yaml"),

@@ -404,11 +404,9 @@ def test_photographs_that_show_nothing_stop_inspection_and_run(scene, kind, capl
     make_blank([files[1]], kind)
     inspection = Inspection.from_folder(scene)
     if kind != "mask":
-        assert any(
-            "1 photo is black, of a single color, or transparent (01.png)" in f.text for f in inspection.findings
-        )
+        assert any("1 photo is black, a single color, or transparent (01.png)" in f.text for f in inspection.findings)
         RunScene.from_scene(SceneSettings(path=str(scene)), read_scene(scene))
-        assert "1 photo without content (black, of a single color, or transparent): 01.png" in caplog.text
+        assert "1 photo is blank (black, a single color, or transparent): 01.png" in caplog.text
         make_blank(files, kind)
         inspection = Inspection.from_folder(scene)
     with pytest.raises(DataError) as error:

@@ -87,7 +87,7 @@ def test_blank_photographs_are_refused_as_in_preparation(tmp_path, level):
     with pytest.raises(DataError, match="all photos are blank"):
         gather(photos, tmp_path / "linked", list_photographs(photos))
     photograph(photos / "9.png")
-    assert "9 photos are black or of a single color" in Inspection.from_folder(photos).verdict
+    assert "9 photos are black or a single color" in Inspection.from_folder(photos).verdict
 
 
 def test_inspection_reports_files_that_preparation_skips(tmp_path, caplog):

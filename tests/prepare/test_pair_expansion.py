@@ -117,7 +117,7 @@ mapping.map_cameras(Path({str(matches)!r}), out, attempts=3)
     caplog.clear()
     map_cameras(matches, tmp_path / "half", attempts=3)
     more = len(expand_pairs(matches / "database.db", {"7.jpg", "8.jpg", LAST}))
-    (message,) = [text for text in caplog.messages if "of photos without a camera" in text]
+    (message,) = [text for text in caplog.messages if "that include unregistered photos" in text]
     assert int(message.split()[1]) < more, "what was matched before the kill is kept"
     for name in MODEL:
         whole, half = ((tmp_path / folder / "sparse" / "0" / name).read_bytes() for folder in ("whole", "half"))

@@ -216,5 +216,5 @@ def test_empty_sweep_is_reported(tiny_scene, tmp_path, monkeypatch, caplog):
 
 def test_points_and_sweep_need_points(tiny_scene, tmp_path):
     shutil.copytree(tiny_scene, tmp_path / "bare", ignore=shutil.ignore_patterns("points3d.ply"))
-    with pytest.raises(DataError, match=r"no points; use init: \{source: sweep\}"):
+    with pytest.raises(DataError, match=r"no points; use `init: \{source: sweep\}`"):
         train(tmp_path / "bare", tmp_path / "run", "init.source=points+sweep")

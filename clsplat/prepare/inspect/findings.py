@@ -69,9 +69,10 @@ def _check_capture(facts: Facts, readable_count: int) -> Iterator[Finding]:
         yield Finding("warning", fault, TAKE_MORE)
     if blank := facts.comparison.blank:
         is_all_blank = len(blank) == readable_count
-        blank_text = f"{_count_with_verb(len(blank), 'photo')} black or of a single color"
+        blank_text = f"{_count_with_verb(len(blank), 'photo')} black or a single color"
         fault = "all photos are blank" if is_all_blank else blank_text
-        yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", "export or retake them")
+        remedy = "export them again, or retake them"
+        yield Finding("error" if is_all_blank else "warning", f"{fault} ({_join(blank)})", remedy)
 
 
 MAX_NAMES = 4  # names in a finding
@@ -132,8 +133,8 @@ def _check_photographs(facts: Facts) -> Iterator[Finding]:
         fault, _, remedy = photographs.unusable_reason.removeprefix(f"{facts.path}: ").rpartition("; ")
         yield Finding("error", fault, remedy)
     if photographs.blank:
-        fault = f"{_count_with_verb(len(photographs.blank), 'photo')} black, of a single color, or transparent"
-        yield Finding("warning", f"{fault} ({_join(photographs.blank)})", "remove or export them again")
+        fault = f"{_count_with_verb(len(photographs.blank), 'photo')} black, a single color, or transparent"
+        yield Finding("warning", f"{fault} ({_join(photographs.blank)})", "export them again, or remove them")
     if photographs.cut:
         fault = f"the end is missing from {pluralize(len(photographs.cut), 'image file')} ({_join(photographs.cut)})"
         yield Finding("error", fault, "copy them again")

@@ -106,7 +106,7 @@ def _first_texels(run: Run, side: int) -> tuple[NDArray[np.float32], NDArray[np.
         return texels
     upper_colors = [photo.upper_pixels.mean(axis=0) / 255 for photo in evidence if len(photo.upper_pixels)]
     if not upper_colors:
-        LOG.warning("masks exclude the upper thirds of all photos; the sky starts black")
+        LOG.warning("masks exclude the upper thirds of all photos, so the sky starts black")
     mean = np.mean(upper_colors, axis=0) if upper_colors else np.zeros(3)
     return np.tile(mean, (side**2, 1)).astype(np.float32), np.ones(side**2, bool)
 

@@ -65,7 +65,9 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         return _read_cameras(path)
     frames = data.get("camera_path") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise DataError(f"{path}: expected a JSON object with a list `camera_path`, as nerfstudio exports it")
+        raise DataError(
+            f"{path}: expected a JSON object with a list `camera_path`, as in a path of nerfstudio; export it again"
+        )
     if not 1 <= len(frames) <= MAX_FRAMES:
         raise DataError(f"{path}: has {len(frames)} frames; expected 1 to {MAX_FRAMES}")
     if (camera_type := data.get("camera_type", "perspective")) != "perspective":
@@ -77,7 +79,7 @@ def read(path: Path, scene: Path | None = None) -> CameraPath:
         frame = JsonFrame(path.parent, f"{path}: camera_path[{i}]", entry)
         fov = frame.number("fov")
         if fov is None or not 0.01 <= fov < 179:
-            raise DataError(f"{frame.source}: fov is {quote(fov)}; expected degrees from 0.01 to 179")
+            raise DataError(f"{frame.source}: fov is {quote(fov)}; expected 0.01 to 179 degrees; export the path again")
         matrix = {"transform_matrix": _to_rows(entry.get("camera_to_world"))}
         pose = np.linalg.inv(read_pose(JsonFrame(path.parent, frame.source, matrix)))[:3]
         time = frame.number("render_time")

@@ -196,7 +196,7 @@ def _require_av() -> ModuleType:
         return import_module("av")
     except ImportError as error:
         raise ConfigError(
-            f"MP4 needs PyAV; in a checkout, pip install '.[video]', or use the suffix .webm, {ALTERNATIVE}"
+            f"MP4 needs PyAV; in a checkout, run `pip install '.[video]'`, or use the suffix .webm, {ALTERNATIVE}"
         ) from error
 
 
