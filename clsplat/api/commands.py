@@ -528,9 +528,11 @@ def align(
     out: a model file; for a dataset, a folder for its cameras in this `format`, with the photos if `images` is "copy"
     scene: the dataset of a model file
     level: the source of the up direction, cameras or ground; up becomes -y
-    distances: such as "A;B=1.25", where A and B are "x,y,z", "PHOTO:u,v+PHOTO:u,v", or names in the control file
+    distances: known distances (scale bars), each as "A;B=1.25", in the new unit of length; A and B are "x,y,z",
+        "PHOTO:u,v+PHOTO:u,v", or names of control points
     gps: use the GPS positions in the EXIF data of the photos; coordinates become UTM, and z points up
-    control: a CSV file of points in photos, with the columns point, x, y, z, photo, u, and v
+    control: a CSV file of control points: their world coordinates, if known, and their positions in photos, px; one
+        photo per row; columns: point, x, y, z, photo, u, and v
 
     Returns `scale`, `matrix` (4 x 4), `epsg`, `rms`, the names of `outliers`, the errors of `points` and `distances`,
     and `files`.  Raises DataError if the points do not determine the transform.

@@ -371,12 +371,12 @@ def _to_parameters(path: Path, vertices: NDArray[Any]) -> Parameters:
             f"{path}: not a splat file: it has no {', '.join(missing_columns[:4])}"
             f"{' …' if len(missing_columns) > 4 else ''}; to train from a point cloud, use `clsplat run`"
         )
-    columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_find_degree(path, names)) - 1)))
+    rest_columns = tuple(f"f_rest_{i}" for i in range(3 * (sh_coefficients(_find_degree(path, names)) - 1)))
     parameters = {name: _stack_columns(vertices, columns) for name, columns in columns_by_name.items()}
     if vertices.dtype["x"].itemsize == 8:  # may be world coordinates, for which float32 is too coarse
         exact_means = np.stack([vertices[name].astype(np.float64) for name in "xyz"], axis=1)
         parameters["means"] = np.where(np.isfinite(parameters["means"]), exact_means, parameters["means"])
-    rest = reorder_columns(_stack_columns(vertices, columns), 3, len(columns) // 3)
+    rest = reorder_columns(_stack_columns(vertices, rest_columns), 3, len(rest_columns) // 3)
     parameters["sh_rest"] = np.ascontiguousarray(rest[:, : 3 * (sh_coefficients(MAX_DEGREE) - 1)])
     if is_flat:
         flat_scale = np.minimum(parameters["log_scales"].min(axis=1, keepdims=True) + FLATNESS, FLAT_LOG_SCALE)

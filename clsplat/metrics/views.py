@@ -158,8 +158,8 @@ def color_metrics(
 ) -> dict[str, float]:
     """Return `psnr_color` and `psnr_affine`, in dB, of a render and a photograph, [height, width, 3].
 
-    mask: [height, width], True for unmasked pixels.  `psnr_color` is missing if a half of the image has too few pixels
-    to fit.  NaN in the render counts as black, infinity as white or black.
+    mask: [height, width], True for unmasked pixels.  `psnr_color` is missing if the left or the right half of the
+    image has too few usable pixels; see `fit_colors`.  NaN in the render counts as black, infinity as white or black.
     """
     truth, pixels = photograph / 255.0, np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=1.0, neginf=0.0)
     full_mask = np.ones(truth.shape[:2], bool) if mask is None else mask
@@ -187,7 +187,7 @@ def fit_colors(
 ) -> NDArray[np.float64] | None:
     """Transform the left and right halves of an image by the color model fitted to the other half.
 
-    The fit does not use pixels that are black or white in the photograph.  Returns None if a half has fewer than
+    The fit does not use pixels that are black or white in the photograph.  Returns None if either half has fewer than
     PIXELS_PER_PARAMETER usable pixels per parameter; this depends only on the photograph and the mask, so that models
     are compared on the same views.  The fit also excludes pixels that are brighter than white in the image, if enough
     others remain.

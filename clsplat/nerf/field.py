@@ -113,9 +113,9 @@ class RayRenderer:
 
     def render(self, parameters: Array, rays: Rays) -> Iterator[SampleLevel]:
         """Render rays: yield the coarse level, then the fine level."""
-        level = self._level(parameters, rays, self._coarse_edges(rays), "coarse")
+        level = self._render_level(parameters, rays, self._coarse_edges(rays), "coarse")
         yield level
-        yield self._level(parameters, rays, self._fine_edges(level), "fine")
+        yield self._render_level(parameters, rays, self._fine_edges(level), "fine")
 
     def differentiate(self, parameters: Array, level: SampleLevel, target: RayTarget, gradient: Array) -> None:
         """Add the gradient of the loss of the last rendered level to `gradient`, [P].
@@ -197,7 +197,7 @@ class RayRenderer:
         )
         return edges
 
-    def _level(self, parameters: Array, rays: Rays, edges: Array, name: str) -> SampleLevel:
+    def _render_level(self, parameters: Array, rays: Rays, edges: Array, name: str) -> SampleLevel:
         samples = edges.shape[1] - 1
         tiles = rays.count * samples // SAMPLES
         self.encoding.forward(parameters, Samples(rays.cones, edges))
@@ -240,7 +240,7 @@ class Field:
     def __init__(self, shape: FieldShape, parameters: Array, background: Array) -> None:
         """parameters: [P], changed in place by training; background: [3] in [0, 1]."""
         self.shape, self.parameters = shape, parameters
-        self.levels = RayRenderer(Workspace(parameters.device), shape, background)
+        self.ray_renderer = RayRenderer(Workspace(parameters.device), shape, background)
 
     @classmethod
     def initial(cls, shape: FieldShape, seed: int, background: Array) -> "Field":
@@ -249,13 +249,13 @@ class Field:
 
     @property
     def workspace(self) -> Workspace:
-        return self.levels.workspace
+        return self.ray_renderer.workspace
 
     def paint(self, camera: DeviceCamera) -> Array:
         """Return the image of the fine level, [3, rows, stride], zero outside the camera's pixels."""
         image = self._empty(camera)
         for _, level in self._render_batches(camera):
-            self.levels.write_colors(level, image)
+            self.ray_renderer.write_colors(level, image)
         return image
 
     def render_layers(self, camera: DeviceCamera, depth: bool = False) -> Layers:
@@ -266,7 +266,7 @@ class Field:
         image, size = self._empty(camera), (camera.height, camera.width)
         alpha, depths = (np.zeros(camera.height * camera.width, np.float32) for _ in range(2))
         for pixels, level in self._render_batches(camera):
-            self.levels.write_colors(level, image)
+            self.ray_renderer.write_colors(level, image)
             weights, edges = (array.get()[: len(pixels)].astype(np.float64) for array in (level.weights, level.edges))
             opacity, weighted_depth = weights.sum(axis=1), (weights * (edges[:, :-1] + edges[:, 1:]) / 2).sum(axis=1)
             alpha[pixels] = np.minimum(opacity, 1)  # rounding may exceed 1
@@ -285,6 +285,6 @@ class Field:
         pixels, count = np.arange(camera.width * camera.height, dtype=np.uint32), rays_per_pass(self.shape)
         for first in range(0, len(pixels), count):
             batch = pixels[first : first + count]
-            rays = self.levels.cast(camera, self.workspace.device.upload(batch))
-            *_, level = self.levels.render(self.parameters, rays)
+            rays = self.ray_renderer.cast(camera, self.workspace.device.upload(batch))
+            *_, level = self.ray_renderer.render(self.parameters, rays)
             yield batch, level

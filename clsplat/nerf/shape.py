@@ -149,7 +149,7 @@ class FieldShape(Settings):
     """Number of frequencies of the direction's encoding."""
 
     @model_validator(mode="after")
-    def _check_depths(self) -> "FieldShape":
+    def _check_consistency(self) -> "FieldShape":
         if self.far <= self.near:
             raise ValueError(f"'far' must be larger than 'near', {self.near:g}; got {self.far:g}")
         if self.skip is not None and self.skip >= self.depth - 1:

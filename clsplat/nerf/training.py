@@ -173,16 +173,16 @@ class LearnedField(TrainedField):
         self, photo: RayPhotograph, scale: float, coarse_weight: float, draw: RandomKey, errors: list[Array]
     ) -> None:
         """Add the gradient for the rays of one photo, in passes."""
-        levels, count = self.field.levels, rays_per_pass(self.field.shape)
+        renderer, count = self.field.ray_renderer, rays_per_pass(self.field.shape)
         colors = photo.photograph.planes(self.field.workspace).colors
         scales = coarse_weight * scale, scale
         for first in range(0, photo.rays, count):
             rays_draw = RandomKey(draw.seed, draw.step, draw.first + first)
-            rays = levels.sample_rays(photo.camera, rays_draw, min(count, photo.rays - first))
-            sample_levels = levels.render(self.field.parameters, rays)
+            rays = renderer.sample_rays(photo.camera, rays_draw, min(count, photo.rays - first))
+            sample_levels = renderer.render(self.field.parameters, rays)
             for level, level_scale, level_errors in zip(sample_levels, scales, errors, strict=True):
                 target = RayTarget(colors, level_scale, level_errors)
-                levels.differentiate(self.field.parameters, level, target, self._gradient)
+                renderer.differentiate(self.field.parameters, level, target, self._gradient)
 
 
 def _parse_shape(data: Mapping[str, Any]) -> FieldShape:
@@ -206,19 +206,19 @@ class FieldPlan:
     parameters: int  # one table of parameters
     features: int  # features and gradients of the samples of one pass
     partials: int  # sums of chunks of samples, for each parameter of the network
-    photographs: int
+    photograph_bytes: int
 
     @property
     def total_bytes(self) -> int:
         """The required memory in total, with TABLE_COUNT tables of parameters."""
-        return TABLE_COUNT * self.parameters + self.features + self.partials + self.photographs
+        return TABLE_COUNT * self.parameters + self.features + self.partials + self.photograph_bytes
 
     def text(self, limits: DeviceLimits) -> str:
         """Return a line of text: the required memory, and the memory of the device."""
         return (
             f"memory: {self.total_bytes / MIB:,.0f} MiB for a field ({TABLE_COUNT} tables of "
             f"{self.parameters / MIB:,.0f} MiB, "
-            f"samples {(self.features + self.partials) / MIB:,.0f} MiB, photos {self.photographs / MIB:,.0f} MiB) "
+            f"samples {(self.features + self.partials) / MIB:,.0f} MiB, photos {self.photograph_bytes / MIB:,.0f} MiB) "
             f"in {limits.memory / MIB:,.0f} MiB with buffers up to {limits.allocation / MIB:,.0f} MiB"
         )
 
@@ -231,14 +231,14 @@ class FieldPlan:
             )
 
 
-def field_plan(shape: FieldShape, photographs: int) -> FieldPlan:
-    """Return the memory plan for training a field.  photographs: bytes of the photos on the device."""
+def field_plan(shape: FieldShape, photograph_bytes: int) -> FieldPlan:
+    """Return the memory plan for training a field.  photograph_bytes: bytes of the photos on the device."""
     samples = rays_per_pass(shape) * max(shape.coarse_samples, shape.fine_samples)
     hidden_rows = (shape.depth + 3) * shape.width  # outputs of the trunk, and gradients of three layers
     encoded_rows = shape.position_rows + shape.grid_rows + PLACE_ROWS + shape.direction_rows
     rows = hidden_rows + encoded_rows + shape.width + 2 * shape.color_width + 4 * COLOR_ROWS
     chunks = -(-samples // (SAMPLES * CHUNK))
-    return FieldPlan(4 * shape.table_length, 4 * rows * samples, 4 * chunks * shape.network_length, photographs)
+    return FieldPlan(4 * shape.table_length, 4 * rows * samples, 4 * chunks * shape.network_length, photograph_bytes)
 
 
 # Check that photos show the cube of a field's grid, since nothing is trained outside it.

@@ -136,7 +136,11 @@ def _find_faulty_driver(drivers: Mapping[Path, str], fault: str) -> DeviceError:
 
 
 def _loading_fault(variables: Mapping[str, str]) -> str | None:
-    """Load all runtimes in a child process.  Return None if it lists the devices, else its failure as a verb phrase."""
+    """Load all runtimes in a child process.
+
+    Returns None if the child process lists the devices or ends before it loads a runtime; otherwise a verb phrase that
+    says how loading fails.
+    """
     result = run_module(PROBE_MODULE, seconds=LOADING_SECONDS, variables=variables)
     if LOADED in result.output or LOADING not in result.output:  # without the first line, loading did not start
         return None

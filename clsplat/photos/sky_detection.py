@@ -71,9 +71,9 @@ def detect_sky(scene: Scene, views: Iterable[tuple[View, Image, Mask | None]]) -
     """
     up = up_direction(scene.split("train"))
     for view, image, unmasked in views:
-        small = _reduce(image)
+        small = _downscale(image)
         small_mask = (
-            np.ones(small.shape[:2], bool) if unmasked is None else _reduce(255 * unmasked.astype(np.uint8)) == 255
+            np.ones(small.shape[:2], bool) if unmasked is None else _downscale(255 * unmasked.astype(np.uint8)) == 255
         )
         mask = sky_mask(small, _visible_points(scene, view) * (small.shape[1] / view.camera.width), small_mask)
         yield SkyEvidence(view, small, mask, small_mask, up)
@@ -153,7 +153,7 @@ def _visible_points(scene: Scene, view: View) -> NDArray[np.float64]:
     return np.stack(pixels, axis=1)
 
 
-def _reduce(image: Image) -> Image:
+def _downscale(image: Image) -> Image:
     factor = SIDE / max(image.shape[:2])
     if factor >= 1:
         return image

@@ -52,7 +52,7 @@ def field_annotation(field: FieldInfo) -> Any:
 
 @lru_cache(maxsize=1024)
 def annotations(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the annotations of a model's fields, with their metadata, by name."""
+    """Return the type annotations of the fields of a settings class, with their metadata, by field name."""
     return {name: field_annotation(field) for name, field in model.model_fields.items()}
 
 

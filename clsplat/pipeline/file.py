@@ -69,7 +69,7 @@ class SceneSettings(Settings):
     @field_validator("masks")
     @classmethod
     def _make_absolute(cls, masks: str | None) -> str | None:
-        """Make the path absolute, as a run may be evaluated from another working folder."""
+        """Make the path absolute, as a run may be evaluated from another working directory."""
         return masks and str(Path(masks).absolute())
 
     @property

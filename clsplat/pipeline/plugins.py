@@ -231,7 +231,12 @@ def _imports(module: ModuleType) -> list[ModuleType]:
 
 
 def _locate(module: str, path: Path | None, error: BaseException) -> str:
-    """Return the file and line of a failure: the innermost frame in the plug-in, else outside of the import system."""
+    """Return the location of a failure, as FILE:LINE if it is known.
+
+    The location is that of the syntax error, or of the innermost stack frame in the plug-in.  If there is none, it is
+    that of the innermost frame outside of the import system, except for an error of clsplat; otherwise, the path of the
+    plug-in's file, or the name of its module.
+    """
     if isinstance(error, SyntaxError) and error.filename and Path(error.filename).is_file():
         return f"{error.filename}:{error.lineno}"
     frames = [

@@ -10,7 +10,7 @@ from clsplat.gaussians.sky import SIDES
 
 
 class Backdrop(Settings):
-    """The background behind the Gaussians."""
+    """Base class of the settings of `model.background`."""
 
     @property
     def sky(self) -> "EnvironmentMap | None":

@@ -299,9 +299,9 @@ class Rasterizer:
     def _halve_bands(self, camera: DeviceCamera) -> bool:
         """Halve the height of the bands; return whether any had more than one row of tiles."""
         self.tiler.reset_capacity()
-        bands = self._bands.get(camera.tiles_y, 1)
-        self._bands[camera.tiles_y] = 2 * bands
-        return bands < camera.tiles_y
+        band_count = self._bands.get(camera.tiles_y, 1)
+        self._bands[camera.tiles_y] = 2 * band_count
+        return band_count < camera.tiles_y
 
     def _forward(self, model: DeviceModel, camera: DeviceCamera, background: Array, content: Content) -> Frame:
         bands = self._split(camera)
@@ -368,10 +368,10 @@ class Rasterizer:
         return self.device.program(f"blend_{schedule}.cl", **defines, **DEFINES.get(content, {}))
 
     def _split(self, camera: DeviceCamera) -> list[Band]:
-        bands = min(self._bands.get(camera.tiles_y, 1), camera.tiles_y)
-        if bands == 1:
+        band_count = min(self._bands.get(camera.tiles_y, 1), camera.tiles_y)
+        if band_count == 1:
             return [Band(camera.tiles_x, camera.tiles_y, 0, camera.tiles_y)]
-        rows = np.linspace(0, camera.tiles_y, bands + 1).astype(int)
+        rows = np.linspace(0, camera.tiles_y, band_count + 1).astype(int)
         return [Band(camera.tiles_x, camera.tiles_y, int(begin), int(end)) for begin, end in pairwise(rows)]
 
     def _launches(self, band: Band, buckets: int = 0) -> list[tuple[int, int]]:

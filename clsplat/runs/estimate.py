@@ -58,10 +58,10 @@ def estimate_time(
     names, measures: file names and measures of the photos to prepare.  run: None if the scene is not prepared yet.
     """
     estimates = list(_estimate_preparation(planned_steps, len(names))) if names else []
-    if (training_size := _find_training_size(pipeline, planned_steps, names, run)) is not None:
+    if (size_and_count := _find_training_size_and_count(pipeline, planned_steps, names, run)) is not None:
         settings = (apply_adaptation(pipeline, measures) if measures and run is None else pipeline).settings
         training_stages = [stage for stage in settings.stages if isinstance(stage, Optimize)]
-        estimates += [_estimate_training(training, *training_size, device.info.units) for training in training_stages]
+        estimates += [_estimate_training(training, *size_and_count, device.info.units) for training in training_stages]
     field_stages = [stage for stage in pipeline.settings.stages if isinstance(stage, TrainField)]
     estimates += [_estimate_field(training, device.info.units) for training in field_stages]
     if not estimates:
@@ -79,7 +79,7 @@ def _estimate_preparation(planned_steps: Sequence[PlannedStep], photo_count: int
             yield Estimate(planned_step.step.stage, (seconds[0] * count, seconds[1] * count), f"{count:,} {unit}")
 
 
-def _find_training_size(
+def _find_training_size_and_count(
     pipeline: Pipeline, planned_steps: Sequence[PlannedStep], names: Sequence[str], run: Run | None
 ) -> tuple[tuple[int, int], int] | None:
     """Return the size of the training images, px, and the initial number of Gaussians; None if the size is unknown."""

@@ -115,7 +115,7 @@ def make_video(
             canvas, views, target.out, target.file_format, extras.layers, photo_files, is_video=not is_still
         )
     else:
-        side = _make_side(extras.side, plan, used_scene, background, opened_device, origin)
+        side = _side_image_function(extras.side, plan, used_scene, background, opened_device, origin)
         render_video(canvas, plan, videos, side, lambda views: counted(views, "frames rendered", len(views)))
         files = list(videos.values())
     return {
@@ -137,7 +137,10 @@ def _read(model: Path) -> AnyModel:
 def _read_scene(
     model: Path, scene: Path | None, host_model: AnyModel, downscale: float | None, is_required: bool
 ) -> Scene | None:
-    """Return the scene of a model at the image size of its run, or None if the scene is unknown and not required."""
+    """Return the scene of a model, or None if the scene is unknown and not required.
+
+    downscale: the divisor of the original image size; None: as in the run.
+    """
     if not is_required and scene is None and not has_pipeline(model):
         return None
     try:
@@ -152,7 +155,7 @@ def _read_scene(
     return source.scene(host_model).downscaled(source.settings.downscale if downscale is None else downscale)
 
 
-def _make_side(
+def _side_image_function(
     name: str | None, plan: VideoPlan, scene: Scene | None, background: Background, device: Device, origin: Floats
 ) -> Side | None:
     """Return a function that returns the image next to a view's frame: the nearest photo, or another model's render."""

@@ -211,7 +211,10 @@ class Lens:
 
     @cached_property
     def _angles(self) -> tuple[Floats, float]:
-        """The angles of view to the left, right, top and bottom, [4] rad, and the angle where the lens folds back."""
+        """The angles of view to the left, right, top and bottom, [4] rad, and the fold angle, rad.
+
+        Beyond the fold angle, the distorted radius no longer increases with the angle from the optical axis.
+        """
         fx, fy, cx, cy, coefficients = self._intrinsics
         angle, side_angles, fold_angles = np.linspace(0, np.pi, ANGLE_COUNT), [], []
         sizes = cx / fx, (self.width - cx) / fx, cy / fy, (self.height - cy) / fy

@@ -224,10 +224,10 @@ SPLIT_FORMAT = "nerfstudio"  # the format that stores the split and times
 TRACKS_FORMAT = "colmap"  # the format that stores which points each photograph shows
 
 
-def check_cameras(scene: Scene, format_: str) -> Scene:
-    """Return the scene with views named like their images.  Raises DataError if the format cannot store it."""
-    renamed_scene, view_by_model = with_image_names(scene), dict[str, str]()
-    for view in renamed_scene.views if format_ == "nerfstudio" else ():
+def check_cameras(scene: Scene, format_: str) -> None:
+    """Raise DataError if a format cannot store the cameras of a scene."""
+    views, view_by_model = with_image_names(scene).views, dict[str, str]()
+    for view in views if format_ == "nerfstudio" else ():
         if (model := photo_lens(view).model) not in DISTORTION:
             raise DataError(f"{view.name}: nerfstudio has no camera model {model}; {REMEDY}")
         view_by_model[DISTORTION[model][0]] = view.name
@@ -237,7 +237,6 @@ def check_cameras(scene: Scene, format_: str) -> Scene:
         raise DataError(
             f"{name}: has the camera model {model}, but others have {other_model}; nerfstudio allows only one; {REMEDY}"
         )
-    return renamed_scene
 
 
 def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", overwrite: bool = False) -> list[Path]:
@@ -251,7 +250,8 @@ def write_cameras(scene: Scene, out: Path, format_: str, images: str = "none", o
         if value not in choices:
             raise ConfigError(f"{name}: expected one of {', '.join(choices)}, got {quote(value)}")
     scene = scene.in_world()
-    renamed_scene = check_cameras(scene, format_)
+    check_cameras(scene, format_)
+    renamed_scene = with_image_names(scene)
     if images == "copy" and format_ in UNDISTORTED and any(view.lens is not None for view in scene.views):
         raise DataError(
             f"{scene.path}: {format_} has no lens distortion, and these photos are distorted; "

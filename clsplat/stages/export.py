@@ -64,32 +64,34 @@ class Export(Scheduled):
 
     def run(self, run: Run) -> None:
         model = host_model(run)
-        path, raw_path, sky_path, without_sky = self.outputs(run.out)
-        if _name(sky_path, run) not in run.model_hashes:
-            sky_path.unlink(missing_ok=True)
-        without_sky.unlink(missing_ok=True)
-        run.model_hashes.pop(_name(without_sky, run), None)
+        path, raw_file, sky_file, without_sky_file = self.outputs(run.out)
+        if _name(sky_file, run) not in run.model_hashes:
+            sky_file.unlink(missing_ok=True)
+        without_sky_file.unlink(missing_ok=True)
+        run.model_hashes.pop(_name(without_sky_file, run), None)
         files = {path: model.baked()}
         if model.sky and self.sky == "splats":
-            files = {path: with_sky_splats(model, center=sky_center(run)), without_sky: model.baked()}
+            files = {path: with_sky_splats(model, center=sky_center(run)), without_sky_file: model.baked()}
         if model.filter_variance is not None:
-            files[raw_path] = model
+            files[raw_file] = model
         options = WriteOptions(quality=self.quality)
-        for file, exported_model_path in files.items():
-            run.model_hashes[_name(file, run)] = exported_model_path.save(file, options)
+        for file, exported_model in files.items():
+            run.model_hashes[_name(file, run)] = exported_model.save(file, options)
             try:
                 if writing_format(file).read:
                     load(file, ReadOptions(quiet=True))
             except DataError as error:
                 raise OutputError(f"{error}; the file was just written: check the disk and its free space") from error
-            LOG.debug("%s written to %s", size_text(len(model), None, len(exported_model_path) - len(model)), file)
-        run.model_hashes.pop(_name(sky_path, run), None)
-        if sky_path.is_file():
-            run.model_hashes[_name(sky_path, run)] = sha256(sky_path)
-        if without_sky in files:
-            LOG.info("%s contains the sky as %s distant Gaussians; %s does not", path, f"{COUNT:,}", without_sky.name)
+            LOG.debug("%s written to %s", size_text(len(model), None, len(exported_model) - len(model)), file)
+        run.model_hashes.pop(_name(sky_file, run), None)
+        if sky_file.is_file():
+            run.model_hashes[_name(sky_file, run)] = sha256(sky_file)
+        if without_sky_file in files:
+            LOG.info(
+                "%s contains the sky as %s distant Gaussians; %s does not", path, f"{COUNT:,}", without_sky_file.name
+            )
         elif model.sky:
-            LOG.info("sky written to %s, which only clsplat reads", sky_path)
+            LOG.info("sky written to %s, which only clsplat reads", sky_file)
 
 
 def sky_gaussians(run: Run) -> int:

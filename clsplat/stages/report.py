@@ -112,7 +112,10 @@ REMEDY = (
 
 
 def overfitting_note(run: Run) -> str:
-    """Return sentences that compare the PSNR of training and held-out views, or "" if it is unknown or unremarkable."""
+    """Return sentences that compare the PSNR of training views with that of held-out views.
+
+    Returns "" if the PSNR of either is unknown, or if only test views were measured and the model does not overfit.
+    """
     if run.best:
         return run.best.text()
     split, scores = _held_out_scores(run)

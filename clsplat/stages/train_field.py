@@ -64,7 +64,7 @@ class TrainField(Training):
     """Steps between lines of metrics.jsonl."""
 
     @model_validator(mode="after")
-    def _check_rays(self) -> "TrainField":
+    def _check_settings(self) -> "TrainField":
         if self.rays % self.photographs:
             raise ValueError(f"'rays' must be a multiple of 'photographs', {self.photographs}; got {self.rays}")
         if any(stage.edits for stage in self.during):
@@ -133,8 +133,8 @@ class TrainField(Training):
 
     def _sample(self, run: Run, pool: ViewPool, step: int) -> Iterator[RayPhotograph]:
         """Yield the photos of a step, each with its number of rays."""
-        for number in range(self.photographs):
-            view = self.order.view_at(pool, (step - 1) * self.photographs + number + 1)
+        for index in range(self.photographs):
+            view = self.order.view_at(pool, (step - 1) * self.photographs + index + 1)
             photograph = run.photographs.get(view)
             if photograph.mask is not None:
                 raise ConfigError(f"train_field: {view.name} has a mask, which fields do not support; remove the masks")

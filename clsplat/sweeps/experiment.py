@@ -113,8 +113,9 @@ class Job:
         start: Start = "new",
         execution: dict[str, Any] | None = None,
     ) -> "Job":
-        """Check a pipeline file, or a shipped pipeline given by its name.  Raises ConfigError.
+        """Return the job of a checked pipeline or matrix.  Raises ConfigError.
 
+        pipeline: a file, or the name of a shipped pipeline.
         out: the run folder; default: runs/NAME, with a number appended if that folder has another run.
         overrides: settings in the form 'stage.key=value'.
         start: "resume" continues from the newest checkpoint; "restart" replaces the run in the folder with a new one.

@@ -123,7 +123,10 @@ class CellAttempt:
         self._last = -math.inf
 
     def take_lease(self, worker: str, since: float) -> None:
-        """Write the lease.  since: start time of the caller, by the clock of the store.  Raises OutputError."""
+        """Write the lease.  Raises OutputError.
+
+        since: when the sweep that requested the cell started, by the store's clock.
+        """
         self._values = {**asdict(Owner.current()), "worker": worker, "since": since, "begun": time.time()}
         self._write()
 
@@ -168,7 +171,7 @@ class CellAttempt:
 
     @property
     def since(self) -> float:
-        """The start time of the caller, by the clock of the store; 0 if unknown."""
+        """When the sweep that requested the cell started, by the store's clock; 0 if unknown."""
         return finite_number(self.lease.get("since")) or 0.0
 
     @property
@@ -335,7 +338,10 @@ class CellFolder:
         return [CellAttempt(path) for path in attempt_paths if path.is_dir() and not path.is_symlink()]
 
     def begin(self, worker: str, since: float) -> CellAttempt:
-        """Start a new attempt, which continues from the newest readable checkpoint.  Raises OutputError."""
+        """Start a new attempt, which continues from the newest readable checkpoint.  Raises OutputError.
+
+        since: when the sweep that requested the cell started, by the store's clock.
+        """
         attempt = CellAttempt(self.path / ATTEMPTS / uuid.uuid4().hex)
         with raising_output_error(attempt.path):
             make_folder(attempt.path)
@@ -347,7 +353,7 @@ class CellFolder:
     def failures(self, since: float) -> list[CellAttempt]:
         """Return the failed attempts after the newest readable checkpoint.
 
-        since: attempts of callers that started before this time, by the clock of the store, are ignored.
+        since: attempts for sweeps that started before this time, by the store's clock, are ignored.
         """
         attempts = self.attempts()
         newest = next((rank for rank, *_ in readable_checkpoints(attempts)), (False, 0))
@@ -410,8 +416,8 @@ class CellFolder:
 # A store may be untrusted.  Links, which may point outside of it, are rejected, and damaged values are ignored.
 
 
-def without_links(root: Path, *names: str) -> Path:
-    """Return a path below a folder.  Raises DataError if a component of it is a symbolic link."""
+def join_without_symlinks(root: Path, *names: str) -> Path:
+    """Join names to the path of a folder.  Raises DataError if a path up to one of the names is a symbolic link."""
     path = root
     for name in names:
         path /= name
@@ -449,16 +455,16 @@ class Store:
     @property
     def prepared(self) -> Path:
         """The folder of the output of `prepare`."""
-        return without_links(self.root, PREPARED)
+        return join_without_symlinks(self.root, PREPARED)
 
     def undistorted_folder(self, scene: str, code: str) -> Path:
         """Return the folder of a scene's undistorted photos.  scene, code: fingerprints in the spec of a cell."""
-        return without_links(self.root, UNDISTORTED, f"{scene[:16]}-{code}", Owner.current().host_slug).parent
+        return join_without_symlinks(self.root, UNDISTORTED, f"{scene[:16]}-{code}", Owner.current().host_slug).parent
 
     def folder(self, key: str) -> CellFolder:
         """Return the folder of a cell, which need not exist.  Raises DataError if it is or contains a symbolic link."""
         for name in (ATTEMPTS, RESULT):
-            without_links(self.root, CELLS, key, name)
+            join_without_symlinks(self.root, CELLS, key, name)
         return CellFolder(self.root / CELLS / key)
 
     def folders(self) -> list[CellFolder]:
@@ -468,7 +474,7 @@ class Store:
 
     def now(self) -> float:
         """Return the current time of the store's file system in seconds, which is the same for all machines."""
-        clock = without_links(self.root, EVENTS, f".{self._process_name}.clock")
+        clock = join_without_symlinks(self.root, EVENTS, f".{self._process_name}.clock")
         with raising_output_error(clock):
             make_folder(clock.parent)
             clock.touch()
@@ -476,7 +482,7 @@ class Store:
 
     def log_event(self, event: str, **values: Any) -> None:
         """Append an event with the current time to the event file of this process."""
-        path = without_links(self.root, EVENTS, f"{self._process_name}.jsonl")
+        path = join_without_symlinks(self.root, EVENTS, f"{self._process_name}.jsonl")
         with raising_output_error(path):
             make_folder(path.parent)
             with path.open("a", encoding="utf-8") as file:
@@ -500,7 +506,7 @@ class Store:
         text: distinguishes matrices with the same name, for example the text of the pipeline file.  Cells that were
         recorded earlier remain.
         """
-        folder = without_links(self.root, SWEEPS)
+        folder = join_without_symlinks(self.root, SWEEPS)
         file = folder / f"{name[:50]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.json"
         cells = {**dict(self.sweeps([file])).get(name, {}), **keys}
         write_text(file, json.dumps({"name": name, "cells": cells}, indent=1) + "\n")
@@ -536,16 +542,16 @@ class Store:
 
     def stop(self, name: str) -> None:
         """Request that running cells stop: those with this key or sweep name, or all cells if the name is "all"."""
-        cancel_file = without_links(self.root, CANCEL, name)
+        cancel_file = join_without_symlinks(self.root, CANCEL, name)
         with raising_output_error(cancel_file):
             make_folder(cancel_file.parent)
             cancel_file.touch()
             os.utime(cancel_file)
 
     def is_cancelled(self, names: Sequence[str], since: float) -> bool:
-        """Return whether a request to stop applies to cells with one of these names that started at `since`.
+        """Return whether cells with one of these names were requested to stop at or after the time `since`.
 
-        since: a time by the clock of the store.
+        since: when the sweep that requested the cells started, by the store's clock.
         """
         for name in (ALL, *filter(None, names)):
             with suppress(OSError):

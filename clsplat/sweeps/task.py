@@ -44,7 +44,7 @@ class Outcome:
 class CellOptions:
     """Options for running a cell."""
 
-    since: float  # start time of the caller, by the clock of the store
+    since: float  # when the sweep that requested the cell started, by the store's clock
     retries: int = 3  # maximum number of failures without a newer checkpoint
     worker: str = "inline"
     sweep: str = ""  # a name that requests to stop can use for all cells of the caller

@@ -77,7 +77,7 @@ class Stage(Settings):
 
     @classmethod
     def named_outputs(cls) -> dict[str, tuple[str, ...]]:
-        """Return the suffixes of each field that is a path inside the run folder, by field."""
+        """Return the allowed file extensions of each setting that is a path inside the run folder, by setting name."""
         marks = {name: _marks(field.annotation, field.metadata) for name, field in cls.model_fields.items()}
         return {name: files[0].suffixes for name, files in marks.items() if files}
 

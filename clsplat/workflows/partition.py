@@ -46,9 +46,10 @@ class PartitionCell:
 
 
 def split_space(means: NDArray[np.floating], weights: Floats, count: int) -> list[PartitionCell]:
-    """Split space into `count` cells whose Gaussians, at `means`, [N, 3], have about the same sum of weights, [N].
+    """Split space into `count` cells whose Gaussians have about the same sum of weights.
 
-    Cells are split across their longest side.  Raises DataError if the model cannot be split into `count` cells.
+    means: [N, 3]; weights: [N].  Cells are split across their longest side.
+    Raises DataError if the model cannot be split into `count` cells.
     """
     if not len(means):
         raise DataError("the model has no Gaussians to partition")

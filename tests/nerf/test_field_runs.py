@@ -313,8 +313,8 @@ def test_images_of_all_sizes_render_completely(small_field, size):
 
 def test_zero_rays_give_no_pixels(small_field):
     camera = upload_camera(small_field.workspace.device, View("v", Camera(4, 4, 9.0, 9.0, 2.0, 2.0), np.eye(3, 4)))
-    rays = small_field.levels.cast(camera, small_field.workspace.device.upload(np.zeros(0, np.uint32)))
-    levels = list(small_field.levels.render(small_field.parameters, rays))
+    rays = small_field.ray_renderer.cast(camera, small_field.workspace.device.upload(np.zeros(0, np.uint32)))
+    levels = list(small_field.ray_renderer.render(small_field.parameters, rays))
     assert [level.colors.shape for level in levels] == [(0, 3), (0, 3)]
 
 
@@ -324,7 +324,7 @@ def test_nan_parameter_shows_in_the_render(small_field):
         parameters = small_field.parameters.get()
         parameters[layer.first_bias] = np.nan
         device, shape = small_field.workspace.device, small_field.shape
-        broken = Field(shape, device.upload(parameters), small_field.levels.background)
+        broken = Field(shape, device.upload(parameters), small_field.ray_renderer.background)
         view = View.looking_at([0, -4, 1], [0, 0, 0], [0, 0, 1], Camera(5, 3, 9.0, 9.0, 2.5, 1.5))
         assert np.isnan(paint(broken, view)).any(), layer.name
 

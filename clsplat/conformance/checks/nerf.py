@@ -55,7 +55,7 @@ class FieldCase:
     """A field with random parameters, and rays of a camera with a random photograph."""
 
     shape: FieldShape
-    levels: RayRenderer
+    renderer: RayRenderer
     parameters: NDArray[np.float32]
     photograph: NDArray[np.float32]  # [3, HEIGHT, WIDTH]
     planes: Array
@@ -75,17 +75,18 @@ class FieldCase:
         scene = random_case(rng, 1, WIDTH, HEIGHT)
         camera, photograph = scene.device_camera(device), rng.random((3, HEIGHT, WIDTH)).astype(np.float32)
         field = Field(shape, device.upload(parameters), device.upload(BACKGROUND))
-        batch, levels = field.levels.sample_rays(camera, draw, rays), field.levels
+        renderer = field.ray_renderer
+        batch = renderer.sample_rays(camera, draw, rays)
         pixels = ref.draw_pixels(WIDTH * HEIGHT, rays, draw.first, draw.seed, draw.step)
         padded_pixels = np.concatenate([pixels, np.repeat(pixels[-1:], batch.count - rays)])
         planes = to_planes(device, camera, photograph)
         cones = ref.cones(scene.camera(), padded_pixels, shape.scene_units)
-        return cls(shape, levels, parameters, photograph, planes, batch, cones)
+        return cls(shape, renderer, parameters, photograph, planes, batch, cones)
 
     @property
     def device_parameters(self) -> Array:
         """The parameters in a new array on the device."""
-        return self.levels.workspace.device.upload(self.parameters)
+        return self.renderer.workspace.device.upload(self.parameters)
 
     def uniforms(self, samples: int, stream: int) -> NDArray[np.float64]:
         """Return the random numbers for the edges of each ray, [rays, samples + 1]."""
@@ -144,7 +145,7 @@ def cones_of_pixels(device: Device, rng: np.random.Generator) -> Results:
 
 def _check_edge(case: FieldCase, label: str) -> Results:
     coarse_edges, fine_edges = (
-        (level.edges.get(), level.weights.get()) for level in case.levels.render(case.device_parameters, case.rays)
+        (level.edges.get(), level.weights.get()) for level in case.renderer.render(case.device_parameters, case.rays)
     )
     shape, (edges, weights) = case.shape, coarse_edges
     coarse, fine = case.uniforms(shape.coarse_samples, ref.COARSE), case.uniforms(shape.fine_samples, ref.FINE)
@@ -163,10 +164,11 @@ def encodings(device: Device, rng: np.random.Generator) -> Results:
     """Compare the encoded positions and directions, the inputs of the network."""
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, RandomKey(1, 2, 0))
-        level = next(case.levels.render(case.device_parameters, case.rays))
+        level = next(case.renderer.render(case.device_parameters, case.rays))
         position, direction = case.encode(level.edges.get())
         (table, row), (direction_table, direction_row) = (
-            rows(level.raw_colors.shape[0]) for rows in (case.levels.network.position, case.levels.network.direction)
+            rows(level.raw_colors.shape[0])
+            for rows in (case.renderer.network.position, case.renderer.network.direction)
         )
         actual = read_rows(table, row, case.shape.position_rows)
         yield compare_max("encode_frustums", f"{count} rays", actual[:, : position.shape[1]], position, ENCODING, 1.0)
@@ -201,9 +203,9 @@ def grids_of_features(device: Device, rng: np.random.Generator) -> Results:
     """Compare the positions of samples in a grid, their features, and the gradients of the grid's entries."""
     for count in RAYS:
         case = FieldCase.sample(device, rng, count, RandomKey(1, 2, 0), grid=GRID)
-        level = next(case.levels.render(case.device_parameters, case.rays))
+        level = next(case.renderer.render(case.device_parameters, case.rays))
         means, variances = case.grid_positions(level.edges.get())
-        actual = read_rows(case.levels.encoding.grid_positions(level.raw_colors.shape[0]), 0, PLACE_ROWS)
+        actual = read_rows(case.renderer.encoding.grid_positions(level.raw_colors.shape[0]), 0, PLACE_ROWS)
         yield compare_max("grid_places", f"means of {count} rays", actual[:, :3], means, 1e-5, 1.0)
         yield compare_max("grid_places", f"variances of {count} rays", actual[:, 3], variances, 1e-3)
     for tiles, bounds, keys in CASES:
@@ -224,14 +226,14 @@ def _flatten_samples(table: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _check_grid(device: Device, rng: np.random.Generator, case: FieldCase, positions: NDArray[np.float32]) -> Results:
-    shape, encoding, tiles = case.shape, case.levels.encoding, len(positions)
+    shape, encoding, tiles = case.shape, case.renderer.encoding, len(positions)
     assert shape.grid is not None
     label = (
         f"{tiles} tiles, {shape.grid.levels} levels of up to {shape.grid.finest} cells and {shape.grid.entries} entries"
     )
     encoding.grid_positions(tiles).set(positions)
     encoding.read_grid(case.device_parameters, tiles)
-    table, first = case.levels.network.position(tiles)
+    table, first = case.renderer.network.position(tiles)
     features = read_rows(table, first, shape.grid_rows)
     grad_features = rng.normal(size=(tiles, shape.grid_rows, SAMPLES)).astype(np.float32)
     grad_features[:, :, ::3] = 0  # samples without a gradient
@@ -278,10 +280,10 @@ def fields(device: Device, rng: np.random.Generator) -> Results:
         errors, expected = device.zeros(2 + count), list[ref.Weights]()
         grad_entries = [np.zeros_like(grid.entries(case.parameters)) for grid in case.grid_levels()]
         parameters = case.device_parameters
-        for scale, level in zip((0.1, 1.0), case.levels.render(parameters, case.rays), strict=True):
+        for scale, level in zip((0.1, 1.0), case.renderer.render(parameters, case.rays), strict=True):
             comparison = _Comparison.from_level(case, level, scale)
             yield from comparison.deviations(f"{count} rays, {level.samples} samples")
-            case.levels.differentiate(parameters, level, RayTarget(case.planes, scale, errors), gradient)
+            case.renderer.differentiate(parameters, level, RayTarget(case.planes, scale, errors), gradient)
             squares = (comparison.differences[:count] ** 2).sum(axis=1)
             yield compare_max(
                 "composite_backward", f"squares of {count} rays", errors.get()[2:], squares, Tol.SUM, 1e-3
@@ -369,7 +371,9 @@ def pictures_of_fields(device: Device, rng: np.random.Generator) -> Results:
     case = FieldCase.sample(device, rng, 1, RandomKey(0, 1, 0))
     field = Field(case.shape, case.device_parameters, device.upload(BACKGROUND))
     pixels = np.arange(WIDTH * HEIGHT, dtype=np.uint32)
-    *_, level = case.levels.render(case.device_parameters, case.levels.cast(case.rays.camera, device.upload(pixels)))
+    *_, level = case.renderer.render(
+        case.device_parameters, case.renderer.cast(case.rays.camera, device.upload(pixels))
+    )
     expected = np.zeros((3, case.rays.camera.rows, case.rays.camera.stride), np.float32)
     expected[:, :HEIGHT, :WIDTH] = level.colors.get()[: len(pixels)].T.reshape(3, HEIGHT, WIDTH)
     yield match("place_colors", f"an image of {WIDTH} x {HEIGHT} px", field.paint(case.rays.camera).get(), expected)

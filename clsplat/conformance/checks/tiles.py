@@ -45,8 +45,8 @@ def check_radix(device: Device, keys: NDArray[Any], bits: int) -> Results:
         actual = tiler.sort_pairs(*inputs, carried=device.upload(carried))[0].get()[:count]
         yield match("radix_scatter", f"values carried with {title}", actual, carried[expected])
         if 2**bits == first.shape[0] - 1:  # one pass
-            places = np.searchsorted(keys[expected], np.arange(2**bits + 1))
-            yield match("radix_scatter", f"first positions of {title}", first.get(), places)
+            expected_offsets = np.searchsorted(keys[expected], np.arange(2**bits + 1))
+            yield match("radix_scatter", f"first positions of {title}", first.get(), expected_offsets)
 
 
 def check_bitonic(device: Device, rng: np.random.Generator, lengths: tuple[int, ...], max_key: int) -> Results:
@@ -101,8 +101,8 @@ def many_tiles(device: Device, rng: np.random.Generator) -> Results:
     offsets, order = make_tiler(device)._sort_by_tile(*inputs)
     expected = np.argsort(pair_tile[:2900], kind="stable")
     yield match("radix_scatter", "order of 2900 pairs in 5000 tiles", order.get()[:2900], expected)
-    places = np.searchsorted(pair_tile[expected], np.arange(tiles + 1))
-    yield match("find_tile_offsets", "offsets of 5000 tiles", offsets.get(), places)
+    expected_offsets = np.searchsorted(pair_tile[expected], np.arange(tiles + 1))
+    yield match("find_tile_offsets", "offsets of 5000 tiles", offsets.get(), expected_offsets)
 
 
 @CHECKS.add("fill_tiles", "sort_tiles", "merge_runs")

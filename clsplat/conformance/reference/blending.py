@@ -267,7 +267,7 @@ def _relative_gap(values: NDArray[Any], threshold: float) -> float:
 
 
 class RenderOutput(NamedTuple):
-    """The result of `render`."""
+    """A rendered image, the transmittance and splat count of its pixels, and the projected Gaussians."""
 
     image: NDArray[Any]  # [3,H,W]
     transmittance: NDArray[Any]  # [H,W]

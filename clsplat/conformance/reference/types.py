@@ -81,7 +81,7 @@ class Splats:
 
 
 class SplatGradients(NamedTuple):
-    """The result of `blend_backward`."""
+    """The gradients of a loss with respect to the values of projected Gaussians."""
 
     mean2d: NDArray[Any]  # [N,2]
     conic: NDArray[Any]  # [N,3] with respect to the scalars of Splats.conic
