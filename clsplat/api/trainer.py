@@ -42,7 +42,7 @@ from clsplat.training.status import StatusFile
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """The result of a training step."""
+    """The gradients of a training step, and the number of Gaussians after it."""
 
     step: int  # global step, from 1
     gaussians: int

@@ -96,7 +96,7 @@ GIB = 2**30
 
 @dataclass
 class DeviceReport:
-    """The result of `clsplat.doctor`."""
+    """The check results of a device, by schedule, from which `verdict` is derived."""
 
     info: DeviceInfo
     default: str  # the default schedule

@@ -24,7 +24,7 @@ EXIT_TIMEOUT_S = 30  # between the end of the output and the exit, during which 
 
 @dataclass
 class CheckResult:
-    """The result of one check on a device."""
+    """The deviations that a check found on a device, and the fault that ended it, if any."""
 
     name: str
     kernels: tuple[str, ...]

@@ -200,7 +200,7 @@ def check_free(folder: Path) -> bool:
 
 
 def _resolve(folder: Path, file: Path) -> Path:
-    """Return the canonical path of a lock file.  Raises OutputError if this process holds it, or if it is a link."""
+    """Return the canonical path of a lock file.  Raises OutputError for a link, or if this process holds the lock."""
     path = file.parent.resolve() / file.name
     _require_not_held(path, folder)
     if path.is_symlink():
@@ -271,7 +271,7 @@ def _take_ownership(file: io.FileIO, is_new: bool, path: Path, folder: Path) -> 
 
 
 def _require_exited_owner(file: io.FileIO, path: Path, folder: Path) -> dict[str, Any]:
-    """Return the owner of a folder on a file system without locks.  Raises OutputError unless it has exited."""
+    """Return the owner of a folder on a file system without locks.  Raises OutputError unless the owner has exited."""
     owner = read_owner(file)
     if not _has_exited(Owner.from_record(owner)):
         raise OutputError(

@@ -83,7 +83,8 @@ BGRA = [2, 1, 0, 3]
 def encode_webp(path: Path, pixels: NDArray[np.uint8], width: int) -> bytes:
     """Encode pixels, [n, 4] RGBA, row by row as an image padded with zeros; alpha must be at least 1.
 
-    WebP drops colors where alpha is 0, so the image is decoded to verify it.  Raises OutputError if it differs.
+    WebP drops colors where alpha is 0, so the image is decoded to verify it.  Raises OutputError if the result
+    differs.
     """
     height = -(-len(pixels) // width)
     image = np.zeros((height * width, 4), np.uint8)

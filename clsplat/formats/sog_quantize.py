@@ -267,7 +267,7 @@ MIN_INSIDE, MIN_BEHIND = 0.01, 0.05  # fractions of all Gaussians
 
 
 def log_weights(p: Parameters, has_sky: bool = False) -> NDArray[np.float64]:
-    """Return the base-2 logarithms of each Gaussian's weight in renders, [N], from -MAX_LOG_WEIGHT to MAX_LOG_WEIGHT.
+    """Return the base-2 logarithm of each Gaussian's weight in renders: [N], from -MAX_LOG_WEIGHT to MAX_LOG_WEIGHT.
 
     Their median is 0, and they do not depend on the scale of the model.  has_sky: whether some Gaussians represent a
     sky; these are excluded from the median.

@@ -26,7 +26,7 @@ def signs(directions: NDArray[np.floating]) -> Floats:
 
 
 def texel_positions(directions: NDArray[np.floating], side: int) -> Floats:
-    """Map directions, [..., 3], to texel coordinates, [..., 2] from -0.5; texel centers are integers."""
+    """Map directions, [..., 3], to texel coordinates, [..., 2], which start at -0.5; texel centers are integers."""
     directions = np.asarray(directions, np.float64)
     sign = signs(directions)
     negative_z = np.minimum(directions[..., 2:], 0)

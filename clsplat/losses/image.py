@@ -68,7 +68,7 @@ class Dssim(ImageLoss):
 
 
 def add_losses(losses: Sequence[ImageLoss], comparison: Comparison) -> list[LossValue]:
-    """Add the gradients of losses, in this order; return their values.  The SSIM kernel also adds an L1 before it."""
+    """Add the gradients of losses, in this order; return their values.  One kernel adds an SSIM and an L1 before it."""
     values, remaining = list[LossValue](), list(losses)
     while remaining:
         loss, following = remaining.pop(0), remaining[0] if remaining else None

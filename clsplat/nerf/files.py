@@ -82,7 +82,7 @@ class FieldModel:
         return Field(self.shape, device.upload(self.parameters), background)
 
     def save(self, path: str | Path) -> str:
-        """Write the field to a file, and return the file's SHA-256.  Raises OutputError if it cannot be written."""
+        """Write the field to a file, and return its SHA-256.  Raises OutputError if the file cannot be written."""
         path, rendering = Path(path), self.rendering
         metadata = Metadata(
             format=FORMAT,

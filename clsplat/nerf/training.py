@@ -271,12 +271,12 @@ def require_visible_grid(shape: FieldShape, scene: Scene) -> None:
 
 
 def _is_in_cube(cube: GridShape, positions: Floats) -> NDArray[np.bool_]:
-    """Return a mask, [M], of the points, [M, 3], that are inside a cube."""
+    """Return a mask, [M], of the positions, [M, 3], inside a cube."""
     return np.asarray((np.abs(positions - (np.array(cube.corner) + cube.side / 2)) <= cube.side / 2).all(axis=1))
 
 
 def _corners(view: View, near: float, far: float, unit: float) -> Floats:
-    """Return the corners of a view's frustum between two depths, [8, 3], in units of `unit`.
+    """Return the corners, [8, 3], of a view's frustum between two depths, in units of `unit`.
 
     They have the order of CORNERS: columns, rows, depth.
     """

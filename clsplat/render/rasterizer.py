@@ -168,7 +168,7 @@ DEFINES = {"inverse_depth": {"INVERSE_DEPTH": 1}, "depth": {"MEDIAN_DEPTH": 1}}
 
 @dataclass(frozen=True)
 class Frame:
-    """The result of a forward pass, for losses and the backward pass; valid until the next forward pass."""
+    """The images and tile lists of a forward pass, read by losses and the backward pass; valid until the next one."""
 
     camera: DeviceCamera
     splats: Array  # [N, RECORD]

@@ -35,7 +35,7 @@ Entry = tuple[int, int, int]  # width, height, and flags as bits: blank, exclude
 
 @dataclass
 class ImageFile:
-    """The result of decoding an image file."""
+    """The digest and the properties of an image file."""
 
     digest: str = ""  # SHA-256 of the content; "" if the file cannot be read
     size: Size | None = None  # size as stored; None if the file cannot be decoded

@@ -111,7 +111,7 @@ VANILLA = DensityConstants()
 
 
 def screen_gradient(grad_mean2d: NDArray[Any], width: int, height: int) -> NDArray[Any]:
-    """Return the norms of gradients in normalized device coordinates, [N], from gradients per px, [N, 2]."""
+    """Return the norms, [N], of gradients in normalized device coordinates, from gradients per px, [N, 2]."""
     return np.hypot(width / 2 * grad_mean2d[:, 0], height / 2 * grad_mean2d[:, 1])
 
 

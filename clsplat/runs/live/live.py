@@ -29,7 +29,7 @@ class Live:
     """A page that shows runs while they train, one after another; a context manager that stops the server on exit."""
 
     def __init__(self, port: int = 0) -> None:
-        """port: on the loopback address; 0 selects the first free default port.  Raises ConfigError if it is in use."""
+        """port: on the loopback address; 0: the first free default port.  Raises ConfigError if the port is in use."""
         self.state = LiveState()
         self._preview: Preview | None = None
         self._server = Server(port, secrets.token_urlsafe(TOKEN_BYTES), Handlers(self.state))
