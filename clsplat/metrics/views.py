@@ -230,13 +230,13 @@ def log_color_metrics(averages: dict[str, Any]) -> None:
         LOG.warning("color-corrected PSNR cannot be measured: %s", reason)
     elif reason:
         LOG.warning(
-            "color-corrected PSNR: %.2f dB, the mean of %s: %s",
+            "color-corrected PSNR %.2f dB, the mean of %s: %s",
             *(psnr_color, pluralize(averages["psnr_color_views"], "view"), reason),
         )
     else:
         is_notable = psnr_color - averages["psnr"] > NOTABLE_GAIN
         note = "; the photos' exposures differ, which PSNR counts as errors" if is_notable else ""
-        LOG.info("color-corrected PSNR: %.2f dB%s", psnr_color, note)
+        LOG.info("color-corrected PSNR %.2f dB%s", psnr_color, note)
 
 
 # PSNR of a dynamic scene, separately for timestamps of training views and others.

@@ -112,9 +112,9 @@ def test_rotated_harmonics_match_rotated_directions(rng):
 @pytest.mark.parametrize(
     ("movement", "message"),
     [
-        ({"rotation": np.diag([1, 1, -1])}, "mirrors"),
-        ({"rotation": 2 * np.eye(3)}, "a rotation matrix"),
-        ({"rotation": np.eye(2)}, "a rotation matrix"),
+        ({"rotation": np.diag([1, 1, -1])}, "is a reflection"),
+        ({"rotation": 2 * np.eye(3)}, "a rotation with a uniform, positive scale"),
+        ({"rotation": np.eye(2)}, "a rotation with a uniform, positive scale"),
         ({"scale": 0}, "positive scale"),
         ({"scale": float("nan")}, "positive scale"),
         ({"translation": 1.0}, r"the translation has shape \(\)"),

@@ -116,7 +116,7 @@ def test_log_reports_the_number_of_averaged_views(caplog):
         ({**whole, "psnr_color_views": 1, "psnr_color_reason": "why"}, r"PSNR 24.00 dB, the mean of 1 view: why$"),
         (
             {"psnr": 20.0, "psnr_color": None, "psnr_color_reason": "why"},
-            r"^PSNR in the .* colors cannot be measured: why$",
+            r"^color-corrected PSNR cannot be measured: why$",
         ),
     ):
         caplog.clear()
