@@ -126,7 +126,7 @@ def test_probe_detects_a_heartbeat_and_its_end(tmp_path):
 
 
 def test_page_explains_every_key_of_the_status():
-    table = PAGE[PAGE.index("## status.json") : PAGE.index("**Is it alive?**")]
+    table = PAGE[PAGE.index("## status.json") : PAGE.index("**Is the run alive?**")]
     named = set(
         re.findall(r"`(\w+)`", " ".join(line.split("|")[1] for line in table.splitlines() if line[:3] == "| `"))
     )

@@ -174,7 +174,7 @@ def test_each_scene_and_size_has_a_table(make_run, tiny_scene, tmp_path):
     assert list(comparison.scenes) == ["tiny", "second", "tiny at 1/2"]
     assert len(comparison.variants) == 1, "the scene does not make a variant"
     page = page_of(tmp_path, first, two, half)
-    assert '<h2>Mean of 3 scenes</h2>\n<p class="sub">test views, at the training size</p>' in page
+    assert '<h2>Mean of 3 scenes</h2>\n<p class="sub">test views at the training size</p>' in page
     assert "<td>30.00" in page[: page.index("<h2>tiny</h2>")]
     assert page.count("No crops: ") == 1, "only the run without renders has none"
 

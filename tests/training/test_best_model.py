@@ -323,7 +323,7 @@ def test_validation_images_do_not_change_the_model(tiny_scene, tmp_path, pipelin
 @pytest.mark.parametrize(
     ("settings", "fault"),
     [
-        (["scene.validation=0"], "set scene.validation: auto"),
+        (["scene.validation=0"], "set `scene.validation: auto`"),
         (["optimize.keep=last", "optimize.patience=3"], "'patience' needs 'keep: best'; set both or neither"),
         (["optimize.keep=last", "optimize.refit=true"], "'refit' needs 'keep: best'"),
     ],
@@ -361,7 +361,7 @@ def test_trainer_needs_a_scene_with_validation_views(tiny_scene, pipeline):
     import clsplat
 
     trainer = Trainer(clsplat.read_scene(tiny_scene), pipeline)
-    with pytest.raises(ConfigError, match="set scene"):
+    with pytest.raises(ConfigError, match="set `scene"):
         trainer.step()
 
 

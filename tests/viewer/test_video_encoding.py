@@ -92,7 +92,7 @@ def test_mp4_without_pyav_names_the_package(tmp_path, monkeypatch):
 
     monkeypatch.delitem(sys.modules, "av", raising=False)
     monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(ConfigError, match=r"pip install '\.\[video\]', or use the suffix .webm"):
+    with pytest.raises(ConfigError, match=r"pip install '\.\[video\]'`, or use the suffix .webm"):
         clsplat.write_video(tmp_path / "a.mp4", pictures())
 
 

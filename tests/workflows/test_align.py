@@ -226,7 +226,7 @@ def test_model_and_its_scene_are_leveled_by_the_same_ground(tmp_path):
         ("point,x\n", {"control": "c"}, "has no column y"),
         (HEADER + "a,1,2,x,00.png,1,2\n", {"control": "c"}, "c.csv:2: z is 'x'; expected a number"),
         (HEADER + "a,1,2,3,00.png,,2\n", {"control": "c"}, "c.csv:2: u is ''"),
-        (HEADER + "a,1,2,3,00.png,1,2\na,1,2,4,01.png,1,2\n", {"control": "c"}, "other coordinates in an earlier row"),
+        (HEADER + "a,1,2,3,00.png,1,2\na,1,2,4,01.png,1,2\n", {"control": "c"}, "different coordinates"),
         (HEADER + "a,1,2,3,00.png,-1,2\na,,,,01.png,1,2\n", {"control": "c"}, "mark in 00.png is outside the photo"),
         (HEADER + "a,,,,00.png,1,2\n", {"control": "c"}, "no point has x, y, and z"),
         (

@@ -208,7 +208,7 @@ def test_blocks_from_a_store_equal_local_ones(tiny_scene, few_steps, tmp_path, m
     cells = clsplat.status(tmp_path / "store")["cells"]
     assert [(cell["name"], cell["state"]) for cell in cells] == [("block_00", "published"), ("block_01", "published")]
     on.write_text("engine: inline\n")
-    with pytest.raises(ConfigError, match="--on: blocks need a store; add the key `store`"):
+    with pytest.raises(ConfigError, match="--on: blocks need a store; add `store`"):
         train(tiny_scene, few_steps, out, blocks=2, min_coverage=NEVER, on=on)
 
 
