@@ -266,7 +266,9 @@ def align(
         if result["rms"] is None
         else f", RMS error {result['rms']:.4g}, {pluralize(len(result['outliers']), 'outlier')}"
     )
-    terminal.print_message(f"{out}: scaled by {result['scale']:.6g}{rms}")
+    cosine = (sum(result["matrix"][i][i] for i in range(3)) / result["scale"] - 1) / 2  # of the angle of a rotation
+    angle = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+    terminal.print_message(f"{out}: rotated by {angle:.1f} degrees, scaled by {result['scale']:.6g}{rms}")
 
 
 @command(

@@ -198,7 +198,7 @@ def test_bare_model_is_leveled_by_its_ground(tmp_path):
     tables["means"][300:], tables["logit_opacity"][:] = means, 2
     clsplat.Model(**tables).transformed(rotation=turn).save(tmp_path / "tilted.ply")
     said = command("align", tmp_path / "tilted.ply", tmp_path / "level.ply", "--level", "ground")
-    assert "scaled by 1" in said.stdout + said.stderr
+    assert "rotated by 23.2 degrees, scaled by 1" in said.stdout + said.stderr
     np.testing.assert_allclose(clsplat.load(tmp_path / "level.ply").means[300:, 1], 0, atol=0.01)
 
 
