@@ -142,7 +142,7 @@ def map_cameras(
 
 
 def _retries(pycolmap: ModuleType, database: Path) -> list[Attempt]:
-    """Return the attempts after the first, without those that make no difference for photographs of these sizes."""
+    """Return the attempts after the first that differ from it for photographs of these sizes."""
     has_small = read_min_long_side(pycolmap, database) < SMALL
     return [attempt for attempt in RETRIES if has_small or not attempt.is_enlarged]
 

@@ -63,7 +63,7 @@ class StepTrainer:
     rates: Rates
     extent: float = 1.0  # scene units
     rows: Rows = "all"  # Gaussians that a step updates
-    views_per_update: Schedule = 1  # Adam updates with the mean gradient of so many views
+    views_per_update: Schedule = 1  # views whose mean gradient an Adam update uses
     modules: Sequence[ModuleState] = ()  # forward in this order, backward in reverse
 
     def step(

@@ -41,7 +41,7 @@ class TrainingStep:
     loss_settings: Sequence[Loss]
     transforms: Sequence[PhotographTransform]
     frame: Frame = field(init=False)
-    frames: list[tuple[Rasterizer, Frame]] = field(default_factory=list)  # of the model, and those that modules start
+    frames: list[tuple[Rasterizer, Frame]] = field(default_factory=list)  # frames of the model and of modules
     planes: Planes = field(init=False)  # the photograph and its mask
     image: Array = field(init=False)  # image that the losses compare with the photograph; a module may replace it
     gradient: Array = field(init=False)  # gradient of the image; each `backward` replaces it with that of its input
